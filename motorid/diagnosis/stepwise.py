@@ -246,17 +246,18 @@ def _as_it_ended(tried: Candidate, last: frozenset[str], met: frozenset[str], al
 def _better(children: Collection[Node], best: Node) -> tuple[Node, list[Node]] | None:
     """Return the best child, if it beats the best model so far, and all in order.
 
-    What physics speaks against is taken only where nothing else helps and held-out runs bear it out. Where the score is
-    sure of nothing, a plain fall of their error begins a ladder: at rest the density prefers what never moves.
+    What physics speaks against is taken only where nothing else helps, held-out runs bear it out and it outdoes what it
+    takes the place of: a friction that is less at rest is a dry one, rounded. Where the score is sure of nothing, a
+    plain fall of their error begins a ladder: at rest the density prefers what never moves.
     """
     better = [c for c in children if beats(c, best)]
     plain = [] if better else [c for c in children if evidence(best, c).plain]
     if plain and best.parent is None:
         plain.sort(key=lambda c: (bool(c.objection), -(evidence(best, c).held_out_fall or 0.0)))
         return plain[0], plain
-    falls = ((c, evidence(best, c).held_out_fall) for c in better)
-    sound = [c for c in better if not c.objection]
-    return choose(sound or [c for c, fall in falls if fall is None or fall > MATERIAL], best)
+    sound, did = [c for c in better if not c.objection], evidence(_path(best)[0], best).fall
+    falls = ((c, evidence(best, c)) for c in better if not best.key - c.key or outdoes(did, evidence(best, c).fall))
+    return choose(sound or [c for c, e in falls if e.held_out_fall is None or e.held_out_fall > MATERIAL], best)
 
 
 def _outdoing(listed: Sequence[Candidate], children: Sequence[Node], best: Node,

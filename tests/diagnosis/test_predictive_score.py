@@ -441,7 +441,7 @@ def test_a_child_that_may_not_be_taken_does_not_keep_a_worse_one_out(rng):
     r, h = rng.normal(size=(2, 1000))
 
     def node(added, fitted, held_out):
-        return SimpleNamespace(added=added, key={added}, size=6, search=0.0, objection="", fit=SHARED,
+        return SimpleNamespace(added=added, key={added}, size=6, search=0.0, objection="", fit=SHARED, parent=None,
                                predictions=both(fitted, held_out))
 
     best, refused, sound = node("coulomb", r, h), node("gravity", 0.2 * r, 1.5 * h), node("cogging", 0.5 * r, 0.9 * h)
@@ -457,11 +457,27 @@ def test_what_physics_speaks_against_must_help_on_held_out_runs(rng, there, take
     def node(objection, fitted, share):
         predictions = both(fitted, h if there is None else share * h)
         predictions = predictions if there is not None else replace(predictions, held_out={})
-        return SimpleNamespace(added="stribeck", key={"stribeck"}, size=6, search=0.0, objection=objection, fit=SHARED,
-                               predictions=predictions)
+        return SimpleNamespace(added="stribeck", key={"stribeck"} if objection else set(), size=6, search=0.0,
+                               objection=objection, fit=SHARED, parent=None, predictions=predictions)
 
     found = stepwise._better([node("omega_s runs to its limit", 0.5 * r, there)], node("", r, 1.0))
     assert (found is not None) == taken
+
+
+@pytest.mark.parametrize(("left", "taken"), [(0.97, False), (0.3, True)])
+def test_what_physics_speaks_against_takes_the_place_only_of_what_it_outdoes(rng, left, taken):
+    """A dry friction rounded at rest was no more named: one less at rest than in motion left 3 % less in its place."""
+    r, h = rng.normal(size=(2, 1000))
+
+    def node(share, parent, *key, objection=""):
+        return SimpleNamespace(added=key[-1] if key else None, key={*key}, size=6, search=0.0, objection=objection,
+                               fit=SHARED, parent=parent, predictions=both(share * r, share * h))
+
+    best = node(0.2, node(1.0, None), "coulomb")
+    wider = node(0.2 * left, best.parent, "stribeck", objection="tau_s < tau_c, which is not physical")
+    beside = node(0.2 * left, best, "coulomb", "gravity", objection="tau_g goes to zero")
+    assert (stepwise._better([wider], best) is not None) == taken
+    assert stepwise._better([beside], best) is not None
 
 
 def test_a_plain_fall_of_the_held_out_error_is_told_where_the_density_is_not_sure(rng):
