@@ -280,17 +280,17 @@ def _insignificant(last: Node, effect: Effect, structure: bool, root: Node,
     """
     fit, own = last.fit, [p for p in effect.parameters if last.fit.problem.model.parameters[p.name].vary]
     sizes = [p.name for p in own if p.null == 0]
-    free = sizes or [p.name for p in own]
-    found = [(fit.values[n], fit.std[n]) for n in free]
-    found += [(own["value"], own["std"]) for n in free for own in fit.per_run.get(n, {}).values()]
+    found = [(fit.values[n], fit.std[n]) for n in sizes]
+    found += [(own["value"], own["std"]) for n in sizes for own in fit.per_run.get(n, {}).values()]
     torques = {} if {"i", "omega"} <= {*fit.problem.outputs} else fit.determined  # K stays open, and every torque
-    found += [(q.value, q.std) for n in free if (q := torques.get(f"{n}_voltage")) is not None]
-    sure = {None if std is None else STANDARD_ERRORS * std < abs(value) for value, std in found}
-    if sizes and sure == {False}:
+    found += [(q.value, q.std) for n in sizes if (q := torques.get(f"{n}_voltage")) is not None]
+    if sizes and not any(std is None or STANDARD_ERRORS * std < abs(value) for value, std in found):
         smaller = without(effect.name)  # deviations are of slopes, and zero may be far from where these hold
         if smaller is None or evidence(smaller, last).fall < PLAIN:
             return f"{listed(sizes)} could as well be zero, within two standard deviations"
-    if free and True not in sure and (sizes or False not in sure) and not any(p.per_run for p in own):
+    free = [p.name for p in own if not sizes or p.name in sizes]
+    known = any(fit.std[n] is not None or f"{n}_voltage" in torques for n in free) or any(p.per_run for p in own)
+    if free and not known:
         more = structure or bool(far(fit))  # than noise
         smaller = without(effect.name) if sizes and not more and far(root.fit) else None
         if more or not far(root.fit) or (smaller is not None and evidence(smaller, last).fall < PLAIN):
