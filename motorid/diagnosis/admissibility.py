@@ -32,9 +32,8 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
     for p, declared in zip(pars, added.parameters, strict=True):
         if p.at_least and fit.values[p.name] < 0.98 * fit.values[p.at_least]:
             return f"{p.name} < {p.at_least}, which is not physical"
-        inside = 1.02 * p.lower < fit.values[p.name] < 0.98 * p.upper
         shaped = (added.includes and added.balance != "voltage") or p.unit in LENGTHS  # a driver's ramp may be any
-        if p.grid and p.vary and not inside and shaped:
+        if p.grid and p.vary and shaped and not 1.02 * p.lower < fit.values[p.name] < 0.98 * p.upper:
             return f"{p.name} runs to its limit: nothing of this shape is in the records"
         if p.vary and p.null is not None and not p.positive and fit.values[p.name] <= p.lower == p.null:
             return f"{p.name} goes to {p.null:g}: the records show none of it, or only with the wrong sign"

@@ -377,8 +377,7 @@ def _flat_topped(run: Experiment) -> bool:
     if "i" not in run.outputs:
         return False
     size = np.abs(run.outputs["i"][np.isfinite(run.outputs["i"])])
-    near = 4 * noise_level(run.outputs["i"], run.t)
-    return bool(np.mean(size > np.quantile(size, 0.995) - near) > FLAT_TOP)
+    return bool(np.mean(size > np.quantile(size, 0.995) - 4 * noise_level(run.outputs["i"], run.t)) > FLAT_TOP)
 
 
 def _without(model: Model, name: str) -> list[Model]:

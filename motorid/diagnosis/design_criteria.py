@@ -638,7 +638,6 @@ def linear_rows(task: Task) -> Rows:
         high += [np.ones(len(r)) for r in rows[1:]]
     if layout.ramps and np.isfinite(task.slew):
         rows.append(np.diff(np.vstack([0 * mix[:1], mix, 0 * mix[:1]]), axis=0))
-        seconds = np.array([1e-3, *layout.ms, 1e-3]) / 1e3
-        high.append(task.slew * seconds / layout.v_max)
+        high.append(task.slew * (np.array([1e-3, *layout.ms, 1e-3]) / 1e3) / layout.v_max)
     limit = np.concatenate(high)
     return Rows(np.zeros(0), np.vstack(rows), -limit, limit)

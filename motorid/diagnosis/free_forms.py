@@ -597,14 +597,14 @@ def ridge(normal: Array, products: Array, residual: Array) -> Array:
     return np.asarray(np.linalg.solve(normal + scale2 * np.eye(len(normal)), products), float)
 
 
-def contains(fit: Fit, form: Form, size: str) -> bool:
-    """Tell whether a form in the place of an effect can be the effect whose size is the parameter `size`: along the
-    model's trajectory, what this puts into the balance or the output is compared with the form's functions."""
+def contains(fit: Fit, form: Form, sizes: Sequence[str]) -> bool:
+    """Tell whether a form in the place of an effect can be the effect of these `sizes`, parameters: along the model's
+    trajectory, what they put into the balance or the output is compared with the form's functions."""
     signals = signals_along(fit)
     span = span_of(fit, signals)
-    if size not in fit.problem.system.parameters or not shown(form, fit, span.ranges):
+    if not {*sizes} <= {*fit.problem.system.parameters} or not shown(form, fit, span.ranges):
         return False
-    push = pushes_of(fit, size)
+    push = pushes_of(fit, *sizes)
     if (place := _column(fit, form)) is None:
         return False
     whole, own = float(np.sum(push**2)), push[:, place]
@@ -622,10 +622,11 @@ def _column(fit: Fit, form: Form) -> int | None:
     return states.index(state) if state in states else None
 
 
-def pushes_of(fit: Fit, name: str) -> Array:
-    """Return what a small change of a parameter adds to each state's rate and to each output, (N, nx + ny)."""
+def pushes_of(fit: Fit, *names: str) -> Array:
+    """Return what parameters that grow by a small share add to each state's rate and to each output, (N, nx + ny)."""
     system, found = fit.problem.system, []
-    nudge = np.array([NUDGE * (abs(fit.values[name]) or 1.0) * (n == name) for n in system.parameters])
+    size = {n: fit.values[n] for n in names} if any(fit.values[n] for n in names) else dict.fromkeys(names, 1.0)
+    nudge = np.array([NUDGE * size.get(n, 0.0) for n in system.parameters])
     for k, (run, sim) in enumerate(zip(fit.problem.runs, fit.simulations, strict=True)):
         values = parameter_vector(fit, k)
         x, u = np.column_stack([sim.states[s] for s in system.states]).T, run.grid.u.T
@@ -643,8 +644,7 @@ def force_of(fit: Fit, form: Form) -> float:
     return float(np.sqrt(np.mean((basis @ form_coefficients(fit, linearised(fit, form), form)) ** 2)))
 
 
-def effect_force(fit: Fit, form: Form, size: str) -> float:
-    """Return what the effect of that size does in the place of a form, RMS along all runs."""
-    rate = pushes_of(fit, size)[:, _column(fit, form)] / NUDGE
+def force_along(fit: Fit, form: Form, sizes: Sequence[str]) -> Array:
+    """Return what the effects of these sizes put into the place of a form, SI, (N,), along all runs."""
     inertia = {"torque": "J", "voltage": "L"}.get(form.balance)
-    return float(np.sqrt(np.mean(rate**2))) * (fit.values[inertia] if inertia else 1.0)
+    return pushes_of(fit, *sizes)[:, _column(fit, form)] / NUDGE * (fit.values[inertia] if inertia else 1.0)

@@ -123,8 +123,7 @@ def binned(name: str, z: Array, d: Array, worth: float = 1.0, bins: int = BINS) 
     half = 1.96 * np.sqrt(np.maximum(square - mean**2, 0.0)) / np.sqrt(np.maximum(n * worth, 1.0))
     total = float(np.sum((d - d.mean()) ** 2))
     between = float(np.sum(count * (mean - d.mean()) ** 2))
-    inside = (total - between) / max(len(d) - keep.sum(), 1)
-    explained = max(between - keep.sum() * inside, 0.0) / max(total, 1e-300)
+    explained = max(between - keep.sum() * ((total - between) / max(len(d) - keep.sum(), 1)), 0.0) / max(total, 1e-300)
     return Binned(name, "J" if name == "heat" else UNITS[name][0], centre[keep], mean[keep], (mean - half)[keep],
                   (mean + half)[keep], count[keep].astype(float), float(min(explained, 1.0)))
 

@@ -219,7 +219,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
         smaller = without(e.name) if not why and (structure or far(last.fit)) else None
         if smaller is not None:
             free = [b for b in beside if not compare(b.predictions, beside[0].predictions).sure]
-            free = [b for b in free if swallows(last.fit, b.form, e)]
+            free = [b for b in free if (differs(last.fit, b.form, e) or 0.0) > TRIFLE]
             free = free or better_forms(smaller.fit, last.fit)
             fall = evidence(smaller, last).fall
             told = [b for b in free if outdoes(fall, b.evidence.fall)]
@@ -310,9 +310,10 @@ def _within_smoothing(fit: Fit, effect: Effect) -> str:
     return ""
 
 
-def swallows(fit: Fit, form: Form, effect: Effect) -> bool:
-    """Tell whether an effect is a special case of a form that differs from it by more than a trifle. A constant
-    friction is one of a friction that changes with the angle."""
+def differs(fit: Fit, form: Form, effect: Effect) -> float | None:
+    """Return by what share of an effect, RMS, a form differs from it of which it is a special case; None if it is none.
+    A constant friction is one of a friction that changes with the angle."""
     sizes = [p.name for p in effect.parameters if p.null == 0]
-    return bool(sizes) and all(free_forms.contains(fit, form, name) for name in sizes) and (
-        free_forms.force_of(fit, form) > TRIFLE * max(free_forms.effect_force(fit, form, name) for name in sizes))
+    if not sizes or not free_forms.contains(fit, form, sizes):
+        return None
+    return free_forms.force_of(fit, form) / float(np.sqrt(np.mean(free_forms.force_along(fit, form, sizes) ** 2)))

@@ -51,8 +51,7 @@ class Node:
     @property
     def search(self) -> float:
         """Nats that chance gains where each order of an angle effect is the best of many."""
-        orders = sum(any(p.order for p in e.parameters) for e in self.fit.model.effects)
-        return orders * float(np.log(SEARCHED))
+        return sum(any(p.order for p in e.parameters) for e in self.fit.model.effects) * float(np.log(SEARCHED))
 
 
 def size_of(model: Model, problem: Problem) -> int:

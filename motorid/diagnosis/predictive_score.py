@@ -194,17 +194,14 @@ def _log_densities(r: Array, labels: NDArray[np.intp], count: int, floor: float)
     nu = thresholds.DEGREES_OF_FREEDOM
     scale2 = float(np.median(r**2)) + 1e-300
     for _ in range(ROUNDS):  # expectation maximisation of the scale
-        weights = (nu + 1) / (nu + r**2 / scale2)
-        before, scale2 = scale2, float(np.mean(weights * r**2)) + 1e-300
+        before, scale2 = scale2, float(np.mean((nu + 1) / (nu + r**2 / scale2) * r**2)) + 1e-300
         if abs(scale2 - before) < SETTLED * before:
             break
     sizes = np.bincount(labels, minlength=count)
     sums = np.bincount(labels, (nu + 1) / (nu + r**2 / scale2) * r**2, count)
-    others = np.maximum(len(r) - sizes, 1)
-    apart = np.where(sizes < len(r), (sums.sum() - sums) / others, scale2) + floor**2 + 1e-300
+    apart = np.where(sizes < len(r), (sums.sum() - sums) / np.maximum(len(r) - sizes, 1), scale2) + floor**2 + 1e-300
     own = apart[labels]
-    weights = -0.5 * np.log(own) - 0.5 * (nu + 1) * np.log1p(r**2 / (nu * own))
-    return np.bincount(labels, weights, count).astype(float)
+    return np.bincount(labels, -0.5 * np.log(own) - 0.5 * (nu + 1) * np.log1p(r**2 / (nu * own)), count).astype(float)
 
 
 def left_out(residual: Array, columns: Array, labels: NDArray[np.intp]) -> Array:

@@ -344,8 +344,7 @@ def _refit_all(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]],
 
 def completed(given_up: Sequence[GivenUp], map_: Callable[..., Iterable[Any]]) -> list[Fit | GivenUp | None]:
     """Return the refits that were only begun, finished; what cannot be stays given up."""
-    begun = [g.begun for g in given_up if g.begun is not None]
-    done = iter(list(map_(_finish, begun)))
+    done = iter(list(map_(_finish, [g.begun for g in given_up if g.begun is not None])))
     return [next(done) if g.begun is not None else g for g in given_up]
 
 

@@ -28,6 +28,7 @@ from motorid.diagnosis.model_comparison import Node, at_noise, far
 from motorid.diagnosis.predictive_score import QUICK, Evidence, HeldOut, Predictions, compare
 from motorid.diagnosis.record_versions import fitted_to, whole_of
 from motorid.diagnosis.refit import refit
+from motorid.diagnosis.thresholds import CONTAINED, TRIFLE
 from motorid.display.numbers import listed, number, percent
 from motorid.effects import PER_RUN
 from motorid.errors import ModelError, OutOfTime, UsageError
@@ -450,9 +451,11 @@ class Remainder:
         Beside what only approximates a form there is no place for it; then the whole model, or without all that does.
         """
         replaced = {name: form for name, form in self._approximating.items() if form is not None}
-        if (base := self._without(replaced)) is not None:
-            yield from _over_zeros(base, dict.fromkeys(replaced.values()))
-        alone = _beyond(self._without(self._approximating) if far(self.fit) else None)
+        if (base := _without(self.fit, replaced)) is not None:
+            asked = dict.fromkeys(replaced.values())
+            yield from ((curve, form) for form in asked if (curve := _instead(self.fit, base, form, replaced)))
+            yield from _over_zeros(base, asked)
+        alone = _beyond(_without(self.fit, self._approximating) if far(self.fit) else None)
         yield from _by_turns(_over_zeros(self.fit, self.forms), alone)
 
     @property
@@ -461,16 +464,17 @@ class Remainder:
         if self._root is None or self._root is self.fit or not far(self.fit):
             return None
         added = {e.name: e for e in self.fit.model.effects if e.name not in self._root.model.effect_names}
-        return self._without(added) if any(map(tells_the_zero, added.values())) else self._root
+        return _without(self.fit, added) if any(map(tells_the_zero, added.values())) else self._root
 
-    def _without(self, names: Iterable[str]) -> Fit | None:
-        """Return the fit without these effects, but for every run's own zero of the angle; None where there is none."""
-        with contextlib.suppress(ModelError):
-            zeros = {e.name for e in self.fit.model.effects if tells_the_zero(e)}
-            model = reduce(Model.without, (n for n in names if n not in zeros), self.fit.model)
-            values = {n: v for n, v in self.fit.values.items() if n in model.parameters}
-            return None if model is self.fit.model else refit(self.fit, model, (values,))
-        return None
+
+def _without(fit: Fit, names: Iterable[str]) -> Fit | None:
+    """Return the fit without these effects, but for every run's own zero of the angle; None where there is none."""
+    with contextlib.suppress(ModelError):
+        zeros = {e.name for e in fit.model.effects if tells_the_zero(e)}
+        model = reduce(Model.without, (n for n in names if n not in zeros), fit.model)
+        values = {n: v for n, v in fit.values.items() if n in model.parameters}
+        return None if model is fit.model else refit(fit, model, (values,))
+    return None
 
 
 def _by_turns(*sources: Iterator[tuple[Curve, Form]]) -> Iterator[tuple[Curve, Form]]:
@@ -640,11 +644,36 @@ def alone_leaving_noise(last: Node, root: Fit, held: HeldOut, forms: Sequence[Fo
     return next((gain for gain in each if gain.evidence.worth_it), None)
 
 
-def beside_leaving_noise(last: Node, form: Form, held: HeldOut) -> FormGain | None:
-    """Return the form where, fitted beside all that `last` has, it leaves no more than noise. Raises OutOfTime."""
+def beside_leaving_noise(last: Node, form: Form, special: Mapping[str, float], held: HeldOut) -> FormGain | None:
+    """Return the form where, fitted beside all that `last` has, it leaves no more than noise; `smaller` where it does
+    so with fewer unknowns in the place of `special` cases of it, given with what they miss. Raises OutOfTime."""
     check_time()
-    grown = _grown(Curve(last.fit, name=_name(last.fit)), form, True, last.predictions, held)
-    return next((FormGain(form, g.gained, g.predictions, beside=True) for g in grown if g.done), None)
+    smaller, found = _without(last.fit, special), list[tuple[int, FormGain]]()
+    for curve in (smaller and _instead(last.fit, smaller, form, special), Curve(last.fit, name=_name(last.fit))):
+        if curve and (curve.begun or found or max(special.values()) > TRIFLE):
+            grown = islice(_grown(curve, form, True, last.predictions, held), TASTED if curve.begun else None)
+            done = ((g, FormGain(form, g.gained, g.predictions, curve.fit is smaller, True)) for g in grown if g.done)
+            found += [(len(g.curve.sizes) + len(curve.fit.q), gain) for g, gain in islice(done, 1)]
+    return min(reversed(found), key=lambda entry: entry[0], default=(0, None))[1]
+
+
+def _instead(fit: Fit, smaller: Fit, form: Form, names: Container[str]) -> Curve | None:
+    """Return a curve of few functions beside a `smaller` fit without effects of these names, which begins as what they
+    do along the fit; None where it cannot."""
+    effects = [e for e in fit.model.effects if e.name in names and not tells_the_zero(e)]
+    known = [p.name for e in effects for p in e.parameters if p.null == 0]
+    if not known or form.carrier == "acceleration" or not free_forms.contains(fit, form, known):
+        return None
+    part = Part.of(fit, form, moved=True)
+    whole, had, sizes = -free_forms.force_along(fit, form, known), list[int](), np.zeros(0)
+    basis = np.concatenate([free_forms.basis_of(form, s, part.span) for s in free_forms.signals_along(fit)])
+    left, norms = whole, np.linalg.norm(basis, axis=0)
+    while len(had) < FEW and float(left @ left) > CONTAINED**2 * float(whole @ whole):
+        had.append(int(np.argmax(np.abs(left @ basis) / np.where(norms > 0, norms, np.inf))))
+        left = whole - basis[:, had] @ (sizes := np.linalg.lstsq(basis[:, had], whole, rcond=None)[0])
+    part = replace(part, chosen=tuple(had))
+    begun = Curve(fit, (part,), (*map(float, sizes), *(place for place, *_ in part.places)))
+    return Curve(smaller, name=_name(smaller), begun=begun)
 
 
 def _name(fit: Fit) -> str:

@@ -211,8 +211,7 @@ def _tried(tangent: Tangent, shape: Shape) -> Tried:
     drop, amounts, left = tangent.explained(shape.columns, shape.nonnegative)
     if not shape.sizes:
         # An amount far from one means that the shape itself is wrong: the drop promises more than it can keep.
-        keeps = 0.2 if amounts[0] < 0.05 else min(1.0, 3.0 / amounts[0])
-        return Tried(keeps * drop, dict(shape.values), left)
+        return Tried((0.2 if amounts[0] < 0.05 else min(1.0, 3.0 / amounts[0])) * drop, dict(shape.values), left)
     if shape.phase is not None:
         cosine, sine = amounts
         found = {shape.sizes[0].name: float(np.hypot(cosine, sine)), shape.phase.name: float(np.arctan2(sine, cosine))}

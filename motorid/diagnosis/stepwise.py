@@ -21,13 +21,13 @@ from motorid.diagnosis import record_versions as versions
 from motorid.diagnosis.adequacy import following, judge_adequacy, within_noise
 from motorid.diagnosis.admissibility import run_through
 from motorid.diagnosis.candidates import Search, Stages, library
-from motorid.diagnosis.misspecification import IN_ITS_PLACE, FormGain, Grade, better_forms, grades_of, outdoes, swallows
+from motorid.diagnosis.misspecification import IN_ITS_PLACE, FormGain, Grade, better_forms, differs, grades_of, outdoes
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of
 from motorid.diagnosis.predictive_score import QUICK, HeldOut, is_sure
 from motorid.diagnosis.refit import BEAM, BEHIND, INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.remainder import alone_leaving_noise, beside_leaving_noise
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
-from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, MATERIAL
+from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, MATERIAL, TRIFLE
 from motorid.diagnosis.verdict import first_answer
 from motorid.errors import OutOfTime, at_least, otherwise
 from motorid.estimation.fit import TOO_FAR, UNFOLLOWED, follows, growth, in_windows, solve
@@ -201,16 +201,16 @@ def _beside_curves(found: Climb) -> Climb:
     noise = found.remaining.adequate and at_noise(best)  # on held-out runs, too
     if noise or all(g.grade == "approximates" for g in grades):
         return found
-    within = [e.name for gain in found.forms[:1] for e in best.fit.model.effects
-              if e.name not in search.root.key and swallows(best.fit, gain.form, e)]
     forms = [gain.form for gain in found.forms]
-    curve = alone_leaving_noise(best, search.root.fit, search.held, forms) or (
-        beside_leaving_noise(best, forms[0], search.held) if within else None)
-    if curve is None:
+    special = {e.name: share for form in forms[:1] for e in best.fit.model.effects if e.name not in search.root.key
+               and (share := differs(best.fit, form, e)) is not None}
+    beside = beside_leaving_noise(best, forms[0], special, search.held) if special else None
+    curve = beside if beside and beside.smaller else alone_leaving_noise(best, search.root.fit, search.held, forms)
+    if (curve := curve or beside) is None:
         return found
     for k, g in enumerate(grades):
         if g.grade != "approximates" and (smaller := search.without(best, g.effect)) is not None and (
-                g.effect in within if curve.beside else
+                special.get(g.effect, 0.0) > (0.0 if curve.smaller else TRIFLE) if curve.beside else
                 curve.smaller or outdoes(evidence(smaller, best).fall, curve.evidence.fall)):
             grades[k] = Grade(g.effect, "approximates", IN_ITS_PLACE.format(curve.form.text), curve.form)
             found = replace(found, remaining=following(found.remaining, curve.form.text))
@@ -339,8 +339,7 @@ def _looks(fit: Fit, held_out: Sequence[Experiment] | None, climbed: Callable[..
     seconds = left()
     as_it_was, records, found = _read_and_climbed(versions.affordable(fit), held_out, climbed)
     yield found, records
-    time_for_all = seconds is None or (left() or 0.0) > 2 * seconds / 3
-    if time_for_all and look(_remembers, found, fit, held_out):
+    if (seconds is None or (left() or 0.0) > 2 * seconds / 3) and look(_remembers, found, fit, held_out):
         *whole, anew = _read_and_climbed(fit, held_out, climbed)
         found = replace(found, stopped=anew.stopped) if anew.stopped else anew
         as_it_was, records = whole if found is anew else (as_it_was, records)
@@ -457,8 +456,7 @@ def _in_windows(found: Climb) -> Fit | None:
     astray = [any(e.nrmse**2 > UNFOLLOWED and e.misfit > LARGER for e in node.predictions.held_out.values())
               or not follows(node.fit) for node in (found.path[0], found.path[-1])]
     part = in_windows(fit, partial(solve, solver=QUICK, start="model")) if fit and growth(fit) >= TOO_FAR else None
-    drawn_back = DRAWS_BACK & (found.path[-1].key - found.path[0].key) and astray[0]
-    if part is None and (drawn_back or astray[1]):
+    if part is None and ((DRAWS_BACK & (found.path[-1].key - found.path[0].key) and astray[0]) or astray[1]):
         part = in_windows(first, partial(solve, solver=QUICK), drifts=True)
     return otherwise(None, FAILURES, lambda: part and solve(part.problem.with_(model=first.model, noise_factors={})))
 

@@ -166,8 +166,7 @@ def driver_slew(m: Equations, T_r=P(0.1, "s", null=0.0, positive=True, grid=(4.0
     Seen as steps that come as ramps, the larger the later; small ones as through a lag of T_r·V_w/V_s. Unless V_s is
     given it is the largest voltage of the records.
     """
-    first = m.base("R") * m.start["i"] + m.base("K") * m.start["omega"]
-    z = m.state("v_ramped", first)
+    z = m.state("v_ramped", m.base("R") * m.start["i"] + m.base("K") * m.start["omega"])
     m.rate(z, V_s / T_r * ca.tanh((m.v - z) / (V_w + V_s * NO_RAMP / T_r)))
     m.voltage -= m.v - z
 

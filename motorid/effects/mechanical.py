@@ -92,8 +92,7 @@ def eddy_brake(m: Equations, c_e=P(1e-5, "N·m·s/rad", null=0.0, lower=0.0, doc
 @effect(balance="torque")
 def load_friction(m: Equations, mu=P(0.1, "", null=0.0, lower=0.0, upper=1.0, doc="share of the motor torque lost")):
     """Friction that grows with the torque carried, μ·abs(K·i)·sgn ω. Duclusaud et al., BAM, 2025."""
-    carried = m.K_t * m.i if "i" in m.states else m.g * m.v
-    m.torque -= mu * ca.fabs(carried) * m.sign(m.omega)
+    m.torque -= mu * ca.fabs(m.K_t * m.i if "i" in m.states else m.g * m.v) * m.sign(m.omega)
 
 
 @effect(balance="torque", includes=("load_friction",))

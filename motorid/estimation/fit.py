@@ -322,8 +322,7 @@ def follows(fit: Fit) -> bool:
 def lost(fit: Fit) -> bool:
     """Tell whether a fit is so far from its records that neither its values nor slopes there lead anywhere: from the
     motion, where that was measured. A current that no model comes near leaves slopes along the motion as they are."""
-    motion = {c: error for c, error in fit.nrmse.items() if c != "i"}
-    return largest(motion or fit.nrmse) > LOST
+    return largest({c: error for c, error in fit.nrmse.items() if c != "i"} or fit.nrmse) > LOST
 
 
 def in_windows(fit: Fit, solve: Callable[[Problem], Fit] = solve, drifts: bool = False) -> Fit | None:

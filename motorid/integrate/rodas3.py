@@ -59,8 +59,7 @@ class StepFunctions:
 
 
 def _dense(name: str, args: dict[str, ca.SX], results: dict[str, ca.SX]) -> ca.Function:
-    made = ca.cse([ca.densify(r) for r in results.values()])
-    return ca.Function(name, [*args.values()], made, [*args], [*results])
+    return ca.Function(name, [*args.values()], ca.cse([ca.densify(r) for r in results.values()]), [*args], [*results])
 
 
 def rosenbrock_step(system: System, x, u0, u1, h, p):
@@ -73,8 +72,7 @@ def rosenbrock_step(system: System, x, u0, u1, h, p):
     stages: list[ca.SX] = []
     for s in range(4):
         at = x + sum((a * k for a, k in zip(A[s], stages, strict=True) if a), ca.SX.zeros(x.numel()))
-        u = u0 + ALPHA[s] * (u1 - u0)
-        rhs = h * (system.rhs(at, u, p) if s > 1 else f) + h * GAMMA_T[s] * drift
+        rhs = h * (system.rhs(at, u0 + ALPHA[s] * (u1 - u0), p) if s > 1 else f) + h * GAMMA_T[s] * drift
         before = sum((c * k for c, k in zip(C[s], stages, strict=True)), ca.SX.zeros(x.numel()))
         stages.append(_solve(factors, rhs + ca.mtimes(mass, before)))
     return x + sum(w * k for w, k in zip(WEIGHTS, stages, strict=True) if w), stages[3]

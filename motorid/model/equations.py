@@ -85,8 +85,7 @@ class Equations:
 
     def sign(self, x: ca.SX) -> ca.SX:
         """Return a smooth sgn(x); the width (rad/s) is chosen from the data, well below the slowest speed."""
-        width = self.symbols.setdefault("sgn_width", ca.SX.sym("sgn_width"))
-        return ca.tanh(x * reciprocal(width * self.smoothing))
+        return ca.tanh(x * reciprocal(self.symbols.setdefault("sgn_width", ca.SX.sym("sgn_width")) * self.smoothing))
 
     def measured(self, channel: str) -> ca.SX:
         """Return what the sensor of `channel` shows so far (several sensor effects follow one another)."""
@@ -123,10 +122,6 @@ class Equations:
         self._known(name)
         self._limits[name] = size
 
-    def _defined(self, name: str) -> ca.SX:
-        found, size = self.definitions[name], self._limits.get(name)
-        return found if size is None else ca.fmax(-size, ca.fmin(size, found))
-
     def state(self, name: str, initial: Any = 0.0) -> ca.SX:
         """Add a state; `initial` may use ``m.start["omega"]`` and the like. Its `rate` must follow."""
         if name in self.states:
@@ -156,14 +151,16 @@ class Equations:
     def fill(self, expressions: list[ca.SX]) -> list[ca.SX]:
         """Return `expressions` with placeholders replaced by definitions; ModelError where these go in a circle."""
         names = list(self.placeholders)
-        symbols = [self.placeholders[n] for n in names]
+        symbols, limits = [self.placeholders[n] for n in names], self._limits
         marks = {s.name() for s in symbols}
         before, used = set[str](), set[str]()
         for _ in range(len(names) + 1):
             before, used = used, {s.name() for s in ca.symvar(ca.vertcat(*expressions))}
             if not used & marks:
                 return expressions
-            expressions = ca.substitute(expressions, [ca.vertcat(*symbols)], [ca.vertcat(*map(self._defined, names))])
+            defined = (ca.fmax(-limits[n], ca.fmin(limits[n], self.definitions[n])) if n in limits
+                       else self.definitions[n] for n in names)
+            expressions = ca.substitute(expressions, [ca.vertcat(*symbols)], [ca.vertcat(*defined)])
         circle = ", ".join(sorted(s[1:] for s in (before | used) & marks))
         raise ModelError(f"the definitions of {circle} go in a circle: an effect scales or replaces a "
                          "quantity by an expression that needs that same quantity.")

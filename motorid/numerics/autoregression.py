@@ -33,8 +33,7 @@ class Colour:
             return np.concatenate([[self.variance], np.zeros(n - 1)])
         # Long enough for what the periodic transform folds back to have died out.
         m = 1 << int(np.ceil(np.log2(max(4 * n, 4096))))
-        response = np.fft.rfft(np.concatenate([[1.0], -self.a]), m)
-        gamma = np.fft.irfft(self.innovation / np.abs(response) ** 2, m)[:n]
+        gamma = np.fft.irfft(self.innovation / np.abs(np.fft.rfft(np.concatenate([[1.0], -self.a]), m)) ** 2, m)[:n]
         return gamma * (self.variance / gamma[0])
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
@@ -44,8 +43,7 @@ class Colour:
         # Through the spectrum, on twice the length so that the ends are not alike.
         m = 1 << int(np.ceil(np.log2(max(2 * n, 4096))))
         response = np.fft.rfft(np.concatenate([[1.0], -self.a]), m)
-        white = np.fft.rfft(np.sqrt(self.innovation) * rng.standard_normal(m))
-        return np.fft.irfft(white / response, m)[:n]
+        return np.fft.irfft(np.fft.rfft(np.sqrt(self.innovation) * rng.standard_normal(m)) / response, m)[:n]
 
 
 def colour_of(parts: Sequence[Array], spent: float = 0.0) -> Colour:

@@ -114,8 +114,7 @@ class LiveFit:
     def png(self, result: Any) -> bytes:
         """Return the figure with the curves of another model on the same records."""
         found, figure = _simulations(result), self._canvas.figure
-        rescaled = sum(part.moved(found[part.run]) for part in self._moving)
-        if rescaled or self._background is None:
+        if sum(part.moved(found[part.run]) for part in self._moving) or self._background is None:
             self._canvas.draw()
             self._background = self._canvas.copy_from_bbox(figure.bbox)
         self._canvas.restore_region(self._background)

@@ -294,8 +294,7 @@ def _steady_rows(system: Any, v: float, means: Mapping[str, float], x: ca.SX, u:
             state[place] = shown if slope.is_zero() else x[place] + (shown - y[at]) / slope
     balances = system.balances(ca.vertcat(*state), u, p)
     par = dict(zip(system.parameters, ca.vertsplit(p), strict=True))
-    drive = par["K"] * means["i"] if "K" in par and "i" in means else par.get("g", 1.0) * v
-    size = ca.vertcat(v, drive)
+    size = ca.vertcat(v, par["K"] * means["i"] if "K" in par and "i" in means else par.get("g", 1.0) * v)
     return balances / ca.if_else(size == 0, 1.0, size)
 
 

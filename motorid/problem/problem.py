@@ -239,8 +239,7 @@ class Problem:
 
     def with_runs(self, runs: tuple[Run, ...]) -> Problem:
         """Return a copy with other grids that keeps everything else already made."""
-        made = ("outputs", "system", "unknowns", "integrator", "measured")
-        return self._lending(replace(self, _runs=runs), made)
+        return self._lending(replace(self, _runs=runs), ("outputs", "system", "unknowns", "integrator", "measured"))
 
     def _lending(self, other: Problem, made: Sequence[str]) -> Problem:
         other.__dict__.update({n: self.__dict__[n] for n in made if n in self.__dict__})

@@ -87,8 +87,7 @@ def time_since(run: Experiment, name: str) -> Array:
         known = np.maximum.accumulate(np.where(off, 0, np.arange(len(v))))
         moved = v[known][1:] * v[known][:-1] < 0
     first = t[0] - (t[-1] - t[0]) * (off[0] or name == "since_reversal")
-    last = np.maximum.accumulate(np.where(moved, t[1:], first))
-    since = t - np.concatenate([[first], last]) + 0.5 * run.dt
+    since = t - np.concatenate([[first], np.maximum.accumulate(np.where(moved, t[1:], first))]) + 0.5 * run.dt
     return np.where(off, -since, since) if name == "since_switch" else since
 
 

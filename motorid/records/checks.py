@@ -304,8 +304,7 @@ def _at_stop(y: Array, top: float) -> bool:
     there = y == top
     if top == 0 or there.sum() < 3 or there.all():
         return False
-    beside = y[~there][np.argmin(np.abs(y[~there] - top))]
-    if np.count_nonzero(y == beside) >= there.sum():
+    if np.count_nonzero(y == y[~there][np.argmin(np.abs(y[~there] - top))]) >= there.sum():
         return False  # levels of a counter, wide apart where it times its pulses
     reach = np.ptp(y)
     step = quantum(y)

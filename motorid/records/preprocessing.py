@@ -55,8 +55,7 @@ def _modulus(steps: Array, reach: float) -> float:
         return 0.0
     calm = np.where(large, 0.0, steps)
     before, after = (np.array([calm[k + a:k + b].mean() for k in beside]) for a, b in ((-BESIDE, 0), (1, BESIDE + 1)))
-    goes_on = (before * steps[beside] < 0) & (after * steps[beside] < 0)
-    sizes = np.abs(steps[beside] - (before + after) / 2)[goes_on]
+    sizes = np.abs(steps[beside] - (before + after) / 2)[(before * steps[beside] < 0) & (after * steps[beside] < 0)]
     modulus = float(np.median(sizes)) if len(sizes) else 0.0
     alike = np.abs(sizes - modulus).max(initial=0.0) < 0.02 * modulus
     return modulus if alike and np.abs(np.abs(steps[at]) - modulus).max() < 1.5 * usual else 0.0

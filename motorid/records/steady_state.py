@@ -102,8 +102,7 @@ def _level(run: Experiment, channel: str, sigma: Mapping[str, float], first: int
         if "omega" in run.outputs:
             return True
         halves = [_slope(run, first, (first + last) // 2), _slope(run, (first + last) // 2, last)]
-        half = (run.t[last] - run.t[first]) / 2
-        allowed = max(4 * 2 * sigma[channel] / half, DRIFT_SHARE * _top_slope(run))
+        allowed = max(4 * 2 * sigma[channel] / ((run.t[last] - run.t[first]) / 2), DRIFT_SHARE * _top_slope(run))
         return bool(np.isfinite(halves).all() and abs(halves[1] - halves[0]) <= allowed)
     middle = (first + last + 1) // 2
     a, b = (part[np.isfinite(part)] for part in (y[first:middle], y[middle:last + 1]))

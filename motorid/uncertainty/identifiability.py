@@ -309,8 +309,7 @@ def suggestions(problem: Problem, q: Array, matrix: Array, missing: int) -> list
 
 def fixable(names: Sequence[str], matrix: Array, missing: int) -> list[tuple[str, ...]]:
     """Return the sets of `missing` parameters that, once fixed, leave the others determined; the best set first."""
-    found = []
-    triangle = np.asarray(np.linalg.qr(matrix, mode="r"))
+    found, triangle = [], np.asarray(np.linalg.qr(matrix, mode="r"))
     for fixed in combinations(range(len(names)), missing):
         s = np.linalg.svd(np.delete(triangle, fixed, axis=1), compute_uv=False)
         if s.size and s[-1] > LEVEL:

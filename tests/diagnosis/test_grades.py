@@ -453,6 +453,24 @@ def test_what_a_wider_law_beside_it_explains_to_the_noise_approximates(monkeypat
     assert "a load that changes with the angle" in rung.why
 
 
+def test_what_a_smaller_law_in_the_place_of_all_its_cases_leaves_as_noise_is_not_named(monkeypatch):
+    """Stops, a spring and a weight for a spring that hardens: the curve begins as what all three do together."""
+    monkeypatch.setattr(stepwise, "alone_leaving_noise", lambda *given: None)
+
+    @mi.effect(balance="torque")
+    def hardening(m, k_h=mi.P(0.029, "N·m/rad³", null=0.0)):
+        m.torque -= k_h * m.theta**3
+
+    motor = mi.dc_motor(R=1.1, L=3e-3, K=0.57, b=0.0167, J=0.036) + hardening
+    runs = [stepped(motor, 30 + k, 800, 5e-3, 12.0, theta=2e-2, i=0.03) for k in range(3)]
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("end_stop", "spring", "gravity"))
+    assert {(r.added, r.grade) for r in found.ladder.rungs[1:]} == {
+        (name, "approximates") for name in ("end_stop", "spring", "gravity")}
+    assert found.remainder.as_effect().doc == "What is left: a load that changes with the angle."
+    assert found.remainder.model.effect_names == ()
+    assert max(found.remainder.fitted.misfit.values()) < 1.05
+
+
 def test_friction_is_known_from_the_current_alone_as_a_voltage():
     """The motor's constant stays open there, and with it every torque."""
     motor = mi.dc_motor(R=1.2, L=1e-3, K=0.05, b=2e-5, J=5e-5) + mi.effects.coulomb(tau_c=8e-3)
