@@ -262,7 +262,7 @@ class Diagnosis(Shown):
     def _next(self) -> tuple[tuple[str, str], ...]:
         after = [("found.best", "the better fit")] if self.after is not self.before else []
         if self.remainder is not None and self.remainder.proposed:
-            after.append(("found.remainder.as_effect()", "what remains, as an effect to add"))
+            after.append(("found.remainder.model + found.remainder.as_effect()", "with what remains as a curve"))
         return (*after, ("mi.plot_missing(found)", "see it"), ('mi.report(found, "report.html")', "all on one page"))
 
     def card(self) -> Card:

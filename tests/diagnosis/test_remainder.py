@@ -138,6 +138,7 @@ def test_it_takes_the_place_of_what_only_approximates_it(beyond, lab):
     assert [(r.added, r.grade) for r in found.ladder.rungs[1:]] == [("quadratic_drag", "approximates")]
     assert re.search(r"close to .*\[quadratic_drag\], c_2 = ", found.text)
     assert found.remainder.model.effect_names == ()
+    assert "found.remainder.model + found.remainder.as_effect()" in dict(found.summary().after)  # not found.best's
     assert found.remainder.model.values["b"] == pytest.approx(found.remainder.fitted.values["b"])  # beside the curve
     fit = mi.fit(found.remainder.model + found.remainder.as_effect(), runs)
     without, with_curve = (over_floor(f, check, clean[-1]) for f in (found.after, fit))
