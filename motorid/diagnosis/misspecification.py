@@ -314,6 +314,7 @@ def differs(fit: Fit, form: Form, effect: Effect) -> float | None:
     """Return by what share of an effect, RMS, a form differs from it of which it is a special case; None if it is none.
     A constant friction is one of a friction that changes with the angle."""
     sizes = [p.name for p in effect.parameters if p.null == 0]
-    if not sizes or not free_forms.contains(fit, form, sizes):
+    if not sizes or not all(free_forms.contains(fit, form, [name]) for name in sizes):
         return None
-    return free_forms.force_of(fit, form) / float(np.sqrt(np.mean(free_forms.force_along(fit, form, sizes) ** 2)))
+    own = max(float(np.sqrt(np.mean(free_forms.force_along(fit, form, [name]) ** 2))) for name in sizes)
+    return free_forms.force_of(fit, form) / own

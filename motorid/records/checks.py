@@ -784,8 +784,7 @@ def _follows(y: Array, cause: Array, least: float = 0.0) -> float:
     near = np.maximum(np.minimum(stays[:-1], stays[1:]) // 4, 1)
     at, near = (x[near > 2 * (least > 0)] for x in (at, near))
     before = (y[at - 1] - y[np.maximum(at - 1 - near, 0)]) / near
-    after = (y[np.minimum(at + near, len(y) - 1)] - y[at - 1]) / (near + 1)
-    return _cosine(cause[at] - cause[at - 1], after - before)
+    return _cosine(cause[at] - cause[at - 1], (y[np.minimum(at + near, len(y) - 1)] - y[at - 1]) / (near + 1) - before)
 
 
 def _holds(values: Array) -> float:
