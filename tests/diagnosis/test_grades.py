@@ -471,6 +471,14 @@ def test_what_a_smaller_law_in_the_place_of_all_its_cases_leaves_as_noise_is_not
     assert max(found.remainder.fitted.misfit.values()) < 1.05
 
 
+@pytest.mark.parametrize(("effect", "special"), [("coulomb", True), ("coulomb_asymmetric", False)])
+def test_a_special_case_of_a_law_is_one_by_each_of_its_sizes(lab, effect, special):
+    """One over the turn may be a friction; not one of two sizes, even where these are hardly apart."""
+    fit = mi.fit(mi.dc_motor() + LIBRARY[effect], runs_of(lab, HIDDEN, channels=("i", "omega", "theta"), n=400)[:2])
+    form = next(f for f in free_forms.FORMS if f.text == "a friction that changes with the angle within a turn")
+    assert (misspecification.differs(fit, form, fit.model.effects[0]) is not None) is special
+
+
 def test_friction_is_known_from_the_current_alone_as_a_voltage():
     """The motor's constant stays open there, and with it every torque."""
     motor = mi.dc_motor(R=1.2, L=1e-3, K=0.05, b=2e-5, J=5e-5) + mi.effects.coulomb(tau_c=8e-3)
