@@ -41,6 +41,12 @@ def weak_friction(m, tau_w=mi.P(1e-3, "N·m", null=0.0, lower=0.0, upper=5e-3)):
     m.torque -= tau_w * m.sign(m.omega)
 
 
+@mi.effect(balance="torque")
+def hardening(m, k_h=mi.P(1e-3, "N·m/rad³", null=0.0)):
+    """A spring that hardens."""
+    m.torque -= k_h * m.theta**3
+
+
 def runs_of(motor, hidden, drives=DRIVES, channels=("i", "omega"), n=600):
     rng = np.random.default_rng(6)
     return [record(driven(motor, hidden, w, n, 1e-3, rng), "logger", channels, motor, rng, w) for w in drives]
@@ -441,11 +447,7 @@ def test_what_a_wider_law_beside_it_explains_to_the_noise_approximates(monkeypat
     monkeypatch.setattr(free_forms, "FORMS", (form,))
     monkeypatch.setattr(stepwise, "alone_leaving_noise", lambda *given: None)
 
-    @mi.effect(balance="torque")
-    def hardening(m, k_h=mi.P(1e-5, "N·m/rad³", null=0.0)):
-        m.torque -= k_h * m.theta**3
-
-    motor = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=4e-4, J=2e-4) + hardening
+    motor = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=4e-4, J=2e-4) + hardening(k_h=1e-5)
     runs = [stepped(motor, 10 * seed + k, 600, 5e-3, 3.0, theta=2e-3) for k in range(3)]
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("end_stop",))
     rung = found.ladder.rungs[1]
@@ -457,11 +459,7 @@ def test_what_a_smaller_law_in_the_place_of_all_its_cases_leaves_as_noise_is_not
     """Stops, a spring and a weight for a spring that hardens: the curve begins as what all three do together."""
     monkeypatch.setattr(stepwise, "alone_leaving_noise", lambda *given: None)
 
-    @mi.effect(balance="torque")
-    def hardening(m, k_h=mi.P(0.029, "N·m/rad³", null=0.0)):
-        m.torque -= k_h * m.theta**3
-
-    motor = mi.dc_motor(R=1.1, L=3e-3, K=0.57, b=0.0167, J=0.036) + hardening
+    motor = mi.dc_motor(R=1.1, L=3e-3, K=0.57, b=0.0167, J=0.036) + hardening(k_h=0.029)
     runs = [stepped(motor, 30 + k, 800, 5e-3, 12.0, theta=2e-2, i=0.03) for k in range(3)]
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("end_stop", "spring", "gravity"))
     assert {(r.added, r.grade) for r in found.ladder.rungs[1:]} == {
