@@ -17,7 +17,17 @@ import numpy as np
 from motorid.diagnosis.admissibility import MELTS, hottest, objections
 from motorid.diagnosis.free_forms import own_levels
 from motorid.diagnosis.misspecification import LIMITER
-from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, preferred, superfluous
+from motorid.diagnosis.model_comparison import (
+    COMMON,
+    Node,
+    at_noise,
+    beats,
+    evidence,
+    far,
+    node_of,
+    preferred,
+    superfluous,
+)
 from motorid.diagnosis.predictive_score import QUICK, Evidence, HeldOut, deciding
 from motorid.diagnosis.refit import LITTLE, STOPPED, GivenUp, Task, completed, hidden_in, led_on, refit, refits, widened
 from motorid.diagnosis.results import Candidate
@@ -115,6 +125,7 @@ class Search:
         self.stages, self.map, self.stopped = stages, stages.map, ""
         self.root = node_of(fit, self.held)
         self._scores: dict[frozenset[str], list[Score]] = {}
+        self._anew: set[frozenset[str]] = set()
         self._always = (*ALWAYS, LIMITER) if any(map(_flat_topped, fit.problem.experiments)) else ALWAYS
         self.nodes: dict[frozenset[str], Node] = {self.root.key: self.root}
 
@@ -302,9 +313,24 @@ class Search:
             smaller = simpler if alone else [*simpler, *_without(node.fit.model, e.name)]
             for model in sorted(smaller, key=lambda m: len(m.free_names)):
                 other = self.smaller(node, model)
+                if other and len(other.key - self.root.key) > 1 and at_noise(node) and far(other.fit):
+                    other = self._from_its_own_start(other)
                 if other and not other.objection and superfluous(node, other) and preferred(other, before):
                     return self.pruned(other, before)
         return node
+
+    def _from_its_own_start(self, node: Node) -> Node:
+        """Return a model of several effects fitted anew, where that predicts better: the values of another that leaves
+        noise, or the few steps of a race, may have led into a valley of its own."""
+        if node.key not in self._anew:
+            self._anew.add(node.key)
+            with contextlib.suppress(*FAILURES):
+                first = {p.name: p.value for e in node.fit.model.effects for p in e.parameters if p.vary}
+                fit = solve(node.fit.problem.with_(model=node.fit.model.start_at(first), noise_factors={}), QUICK)
+                why = next((w for e in fit.model.effects if (w := objections(fit, e))), "")
+                anew = replace(node_of(fit, self.held, node.added, node.parent), objection=why)
+                self.nodes[node.key] = anew if beats(anew, node) else node
+        return self.nodes[node.key]
 
     def exchanged(self, node: Node, before: Node) -> Node:
         """Return a smaller model that does the same as `node` with an effect that these records cannot tell from a

@@ -15,7 +15,7 @@ from motorid.diagnosis.candidates import Stages, library
 from motorid.diagnosis.experiment_design import suggest_experiment
 from motorid.diagnosis.free_forms import WHERE
 from motorid.diagnosis.locate import acting_like, locate
-from motorid.diagnosis.misspecification import LIMITER, in_turn
+from motorid.diagnosis.misspecification import DIFFERENCED, LIMITER, in_turn
 from motorid.diagnosis.model_comparison import far
 from motorid.diagnosis.record_versions import parts_remark
 from motorid.diagnosis.refit import with_lags_exchanged
@@ -98,16 +98,17 @@ def _told(found: Climb, misread: str, driven: str, validated: bool, records: Seq
     """Return what a climb found, in words and as a result; first how the records contradict themselves, `misread`."""
     fit, ladder, remaining = found.search.root.fit, ladder_of(found, validated), found.remaining
     missing, judged, last, units = locate(fit), found.first, found.path[-1], units_of(fit.problem.experiments)
-    names = tuple(g.effect for g in found.grades if g.grade != "approximates")
+    graded = [g for g in found.grades if g.why != DIFFERENCED]
+    names = tuple(g.effect for g in graded if g.grade != "approximates")
     ranking, groups = found.rounds[0] if found.rounds else (), tuple(g for g in found.groups if g[0] in names)
     rivals = found.rivals if groups[:1] == found.groups[:1] else ()
     forms, suggestion = in_turn(found.forms), None
     remaining = following(remaining, forms[0].text) if forms else remaining
-    like = forms[0] if forms else next((g.form for g in found.grades if g.form is not None), None)
+    like = forms[0] if forms else next((g.form for g in graded if g.form is not None), None)
     missing = acting_like(missing, like) if like is not None and not names else missing
     if names:
         verdict, where = "missing", WHERE[{e.name: e.balance for e in ladder.best.model.effects}[names[0]]]
-        answer = words.missing_text(ladder.rungs, remaining, groups, found.grades,
+        answer = words.missing_text(ladder.rungs, remaining, groups, graded,
                                     bool(words.held_out_remark(last)), found.stopped)
         same = _inseparable(found, ladder.best.model)
         details = [words.moves(fit, ladder.best), words.rises_text(ladder.rungs), words.inseparable_remark(same),
@@ -117,17 +118,17 @@ def _told(found: Climb, misread: str, driven: str, validated: bool, records: Seq
             inside = (e.name for e in ladder.best.model.effects if {p.name for p in e.parameters} & {*shared})
             groups = (*groups, (*inside, name))
         suggestion = _suggestion(rivals, groups)
-    elif len(found.path) > 1 or not remaining.adequate:
+    elif graded or not remaining.adequate:
         verdict, where = "unexplained", missing.where
         judged = judged if len(found.path) > 1 else remaining
-        answer = words.unexplained_text(ranking, ladder.rungs, found.grades, like.text if like else "", remaining,
+        answer = words.unexplained_text(ranking, ladder.rungs, graded, like.text if like else "", remaining,
                                         whole={*LIBRARY} <= {e.name for e in found.search.effects},
                                         done=bool(found.rounds) and not found.stopped)
         details = [] if len(found.path) > 1 else [judged.text]
         details += [missing.text, words.rises_text(ladder.rungs)]
     else:
         verdict, where, judged = "adequate", None, remaining
-        answer, *details = words.adequate_text(judged, ranking, ladder.best)
+        answer, *details = words.adequate_text(judged, [c for c in ranking if not c.accepted], ladder.best)
     more = "structure" if verdict == "unexplained" else "fluctuation"  # what imitates a structure hides it
     kind = "structure" if not remaining.adequate else more if far(ladder.best) else "noise"
     details += [] if names else [words.unseen_remark(found.search.unseen(last), fit.model.base)]
@@ -153,8 +154,10 @@ def _remarks(found: Climb, driven: str) -> list[str]:
     late = "" if set(last.problem.outputs) != {"omega"} or "speed_delay" not in found.path[-1].key else (
         f"The speed alone cannot tell a late sensor from a voltage that acts late: --delay {last.values['T_d']:.3g}.")
     stopped = f"Stopped early: {found.stopped}; more may be missing." if found.stopped else ""
+    half = [f"'{g.effect}' in the model is no effect that was missing: {DIFFERENCED}."
+            for g in found.grades if g.why == DIFFERENCED]
     own = words.own_in_every_run_remark(last) if found.search.held.validation is not None else ""
-    return [stopped, driven, windows, late, next(limits, ""), parts_remark(first),
+    return [stopped, driven, *half, windows, late, next(limits, ""), parts_remark(first),
             words.unfinished_remark(last), words.held_out_remark(found.path[-1]), own,
             words.measured_angle_remark(last), words.outliers_remark(last), words.closed_loop_remark(first)]
 

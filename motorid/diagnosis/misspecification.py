@@ -33,6 +33,8 @@ from motorid.records.checks import current_limit
 
 LIMITER = "driver_current_limit"
 IN_ITS_PLACE = "{}, which the library lacks, predicts better in its place"
+DIFFERENCED = "the speed reads half a sample late, as a difference of counts does"
+LATENESS = {"speed_lag": 1.0, "speed_delay": 1.0, "speed_average": 0.5}  # mean, of the time of these effects
 
 
 @dataclass(frozen=True)
@@ -213,6 +215,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     found = []
     for e in (e for e in last.fit.model.effects if e.name not in root.key):
         why, form = objections(last.fit, e, root.fit), None
+        why = DIFFERENCED if _half_a_sample(last.fit, e) else why
         why = why or ("it may only stand in for the driver's current limit" if limited else "")
         why = why or ("the model does not follow the records with it" if structure and not follows(last.fit) else "")
         why = why or _insignificant(last, e, structure, root, without) or _within_smoothing(last.fit, e)
@@ -296,6 +299,15 @@ def _insignificant(last: Node, effect: Effect, structure: bool, root: Node,
         if more or not far(root.fit) or (smaller is not None and evidence(smaller, last).fall < PLAIN):
             return f"{listed(free)} {'are' if free[1:] else 'is'} not determined{', and the rest is not noise' * more}"
     return ""
+
+
+def _half_a_sample(fit: Fit, effect: Effect) -> bool:
+    """Tell whether an effect makes the speed late by half a sample of the records: so is the mean over each."""
+    if effect.name not in LATENESS:
+        return False
+    run, name = fit.problem.experiments[0], effect.parameters[0].name
+    half, late = float(np.median(np.diff(run.t))) / run.meta.get("every", 1) / 2, LATENESS[effect.name]
+    return abs(late * fit.values[name] - half) < max(TRIFLE * half, STANDARD_ERRORS * late * (fit.std[name] or 0.0))
 
 
 def _within_smoothing(fit: Fit, effect: Effect) -> str:

@@ -122,12 +122,18 @@ def _released(measured: Problem) -> Estimate:
     if not all("theta" in run.outputs for run in measured.experiments):
         return QUICKLY(own)
     along = QUICKLY(measured)
-    own = along.onward.for_model(own.model.start_at(along.values))
     if copies_the_angle(along.problem, along.q):
         first = {n: measured.model.parameters[n].value for n in measured.model.free_names}
         return QUICKLY(measured.for_model(own.model.start_at(first)))
+    return _on_its_own(along, QUICKLY)
+
+
+def _on_its_own(along: Estimate, descent: Callable[[Problem], Estimate]) -> Estimate:
+    """Return the estimate along the model's own angle, if that does as well as along the measured one."""
+    model = along.problem.model
     with contextlib.suppress(*FAILURES):
-        if (free := QUICKLY(own)).cost < WORSE * along.cost:
+        own = along.onward.for_model(model.with_(angle_input=False).start_at(along.values))
+        if model.angle_input and (free := descent(own)).cost < WORSE * along.cost:
             return free
     return along
 
@@ -212,10 +218,12 @@ def _polished(fit: Fit, problem: Problem, effort: LevenbergMarquardt) -> Fit | N
 
 
 def led_on(fit: Fit) -> Fit | None:
-    """Return a refit, which ends where further steps tell no two models apart, led on to its optimum; None for none."""
+    """Return a refit, which ends where further steps tell no two models apart, led on to its optimum; None for none.
+    Along the model's own angle, where with all effects that no longer drifts."""
+    descent = partial(by_continuation, effort=OPTIMUM, wide=False)
     with contextlib.suppress(*FAILURES):
-        done = by_continuation(fit.problem.begun_at(fit.q), OPTIMUM, wide=False)
-        return _fit_of(done) if done.cost < fit.cost else None
+        done = _on_its_own(along := descent(fit.problem.begun_at(fit.q)), descent)
+        return _fit_of(done) if done is not along or done.cost < fit.cost else None
     return None
 
 

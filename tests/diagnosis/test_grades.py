@@ -523,6 +523,29 @@ def test_an_answer_names_the_library_only_where_it_was_tried(rubbing):
     assert "not all effects were tried" in none.answer
 
 
+@pytest.mark.parametrize("over", [1, 4])
+def test_half_a_sample_that_a_difference_of_counts_is_late_is_no_missing_effect(over):
+    """In a blind trial a lag of the speed of half a sample was named for plain motors with encoders."""
+    runs = []
+    for seed in (1, 2):
+        run = stepped(mi.dc_motor(R=1.2, L=1e-3, K=0.05, b=2e-4, J=2e-5), seed, 800, 2e-3, i=0.02, theta=1e-9)
+        counts = np.round(run.outputs["theta"] * 4000 / (2 * np.pi))
+        past = np.concatenate([np.full(over, counts[0]), counts])[: len(counts)]
+        speed = 2 * np.pi / 4000 * (counts - past) / (over * 2e-3)
+        runs.append(run.with_(outputs={"i": run.outputs["i"], "omega": speed}))
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), effects=("speed_lag", "speed_average", "coulomb"))
+    last = found.ladder.rungs[-1]
+    if over == 1:
+        assert (found.verdict, found.effects, found.groups) == ("adequate", (), ())
+        assert last.grade == "approximates"
+        assert "half a sample late" in last.why
+        assert f"'{last.added}' in the model is no effect that was missing: {last.why}." in found.text
+        assert "approximates" not in found.text
+    else:
+        assert found.effects == ("speed_average",)
+        assert "half a sample" not in found.text
+
+
 @pytest.mark.parametrize(("noise", "objected"), [(0.02, False), (2.5, True)])
 def test_what_follows_an_angle_that_is_noise_by_more_than_a_turn_is_no_weight(noise, objected):
     """A wheel located by radio: "gravity" lowered the error, led by an angle that was right to 2.5 rad."""
