@@ -125,7 +125,6 @@ class Search:
         self.stages, self.map, self.stopped = stages, stages.map, ""
         self.root = node_of(fit, self.held)
         self._scores: dict[frozenset[str], list[Score]] = {}
-        self._anew: set[frozenset[str]] = set()
         self._always = (*ALWAYS, LIMITER) if any(map(_flat_topped, fit.problem.experiments)) else ALWAYS
         self.nodes: dict[frozenset[str], Node] = {self.root.key: self.root}
 
@@ -314,23 +313,12 @@ class Search:
             for model in sorted(smaller, key=lambda m: len(m.free_names)):
                 other = self.smaller(node, model)
                 if other and len(other.key - self.root.key) > 1 and at_noise(node) and far(other.fit):
-                    other = self._from_its_own_start(other)
+                    # The larger one's values, or the few steps of a race, may have led into a valley of its own.
+                    first = {p.name: p.value for e in other.fit.model.effects for p in e.parameters if p.vary}
+                    other = self._fitted(other, other.fit.model.start_at(first), "auto")
                 if other and not other.objection and superfluous(node, other) and preferred(other, before):
                     return self.pruned(other, before)
         return node
-
-    def _from_its_own_start(self, node: Node) -> Node:
-        """Return a model of several effects fitted anew, where that predicts better: the values of another that leaves
-        noise, or the few steps of a race, may have led into a valley of its own."""
-        if node.key not in self._anew:
-            self._anew.add(node.key)
-            with contextlib.suppress(*FAILURES):
-                first = {p.name: p.value for e in node.fit.model.effects for p in e.parameters if p.vary}
-                fit = solve(node.fit.problem.with_(model=node.fit.model.start_at(first), noise_factors={}), QUICK)
-                why = next((w for e in fit.model.effects if (w := objections(fit, e))), "")
-                anew = replace(node_of(fit, self.held, node.added, node.parent), objection=why)
-                self.nodes[node.key] = anew if beats(anew, node) else node
-        return self.nodes[node.key]
 
     def exchanged(self, node: Node, before: Node) -> Node:
         """Return a smaller model that does the same as `node` with an effect that these records cannot tell from a
@@ -355,14 +343,18 @@ class Search:
         with contextlib.suppress(*FAILURES):
             if (fit := led_on(node.fit)) is not None and hottest(fit) <= MELTS:
                 node = self.nodes[node.key] = replace(node, fit=fit, predictions=self.held.predictions(fit))
-        if node.fit.status != "converged" and far(node.fit):
-            with contextlib.suppress(*FAILURES):
-                problem = node.fit.problem.with_(model=node.fit.model, noise_factors={})
-                fit = solve(problem, QUICK, start="model")
-                if fit.status == "limit":  # on its way still
-                    fit = solve(problem.with_(model=fit.model), RACE, start="model")
-                onward = replace(node, fit=fit, predictions=self.held.predictions(fit))
-                return onward if beats(onward, node) and hottest(fit) <= MELTS else node
+        return self._fitted(node, node.fit.model) if node.fit.status != "converged" and far(node.fit) else node
+
+    def _fitted(self, node: Node, model: Model, start: str = "model") -> Node:
+        """Return a model fitted as a whole, where that predicts better."""
+        with contextlib.suppress(*FAILURES):
+            fit = solve(problem := node.fit.problem.with_(model=model, noise_factors={}), QUICK, start=start)
+            if fit.status == "limit":  # on its way still
+                fit = solve(problem.with_(model=fit.model), RACE, start="model")
+            onward = replace(node, fit=fit, predictions=self.held.predictions(fit), objection=next(
+                (why for e in fit.model.effects if e.name not in self.root.key and (why := objections(fit, e))), ""))
+            if beats(onward, node) and hottest(fit) <= MELTS:
+                self.nodes[node.key] = node = onward
         return node
 
     def without(self, node: Node, name: str) -> Node | None:

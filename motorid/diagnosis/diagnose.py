@@ -120,12 +120,11 @@ def _told(found: Climb, misread: str, driven: str, validated: bool, records: Seq
         suggestion = _suggestion(rivals, groups)
     elif graded or not remaining.adequate:
         verdict, where = "unexplained", missing.where
-        judged = judged if len(found.path) > 1 else remaining
         answer = words.unexplained_text(ranking, ladder.rungs, graded, like.text if like else "", remaining,
                                         whole={*LIBRARY} <= {e.name for e in found.search.effects},
                                         done=bool(found.rounds) and not found.stopped)
-        details = [] if len(found.path) > 1 else [judged.text]
-        details += [missing.text, words.rises_text(ladder.rungs)]
+        judged, known = (judged, []) if len(found.path) > 1 else (remaining, [remaining.text])
+        details = [*known, missing.text, words.rises_text(ladder.rungs)]
     else:
         verdict, where, judged = "adequate", None, remaining
         answer, *details = words.adequate_text(judged, [c for c in ranking if not c.accepted], ladder.best)

@@ -44,8 +44,7 @@ class FormGain:
     form: Form
     evidence: Evidence
     predictions: Predictions
-    smaller: bool = False  # it leaves noise with no more parameters than that model has
-    beside: bool = False  # it leaves noise beside that model, not in its place
+    smaller: bool = False  # it leaves noise with fewer unknowns in the place of effects of that model
 
 
 def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> list[FormGain]:

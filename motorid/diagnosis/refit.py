@@ -69,13 +69,13 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     # A guess of the larger model's own, along the records, is no longer led astray.
     entries = [(start, angular) for start in (*starts, *poles)] + [
         (start, along) for start in _own_starts(fit, model, starts) for along in sorted({angular, False})]
-    first = BEGIN if len(entries) > BEAM else RACE
+    first = BEGIN if len(entries) > FINISHED else RACE
     each = ((_begun(fit, models, start, along, first), along) for start, along in entries)
     begun = [(done, along) for done, along in each if done is not None]
     if not begun and any(starts):
         return raced(fit, model, ())
     begun.sort(key=lambda entry: entry[0].cost)
-    ahead = begun[: max(-(-len(begun) // HALVING), BEAM)]
+    ahead = begun[: max(-(-len(begun) // HALVING), FINISHED)]
     found = begun if first is RACE else [(_race(done.onward, RACE) or done, along) for done, along in ahead]
     best, along = min(found, key=lambda entry: entry[0].cost, default=(None, False))
     open_ = fit.status != "converged" and not lost(fit)
@@ -118,13 +118,13 @@ def refit(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Fit 
 
 def _released(measured: Problem) -> Estimate:
     """Let the model's own angle take the place of the measured one, if good enough, or copied; raises as a fit."""
-    own = measured.for_model(replace(measured.model, angle_input=False, _systems={}))
+    own = measured.model.with_(angle_input=False)
     if not all("theta" in run.outputs for run in measured.experiments):
-        return QUICKLY(own)
+        return QUICKLY(measured.for_model(own))
     along = QUICKLY(measured)
     if copies_the_angle(along.problem, along.q):
         first = {n: measured.model.parameters[n].value for n in measured.model.free_names}
-        return QUICKLY(measured.for_model(own.model.start_at(first)))
+        return QUICKLY(measured.for_model(own.start_at(first)))
     return _on_its_own(along, QUICKLY)
 
 
@@ -263,7 +263,7 @@ def _converged(problem: Problem, effort: LevenbergMarquardt) -> Estimate:
 
 
 LITTLE = 1 - (1 - MATERIAL) ** 2  # of the squared misfit; of 361 refits that promised less none was worth it
-BEAM = 2  # models that the next round grows: that many are finished
+FINISHED = 2  # models of a race at least: slopes and a few steps do not tell the best two apart
 OUTDONE = 1.5  # times the least cost of a race: 20 nats away from a tie at 100 effective samples
 BEHIND = 10.0  # times the cost of a model that explains all but noise
 HARDLY = 1.01  # times: near enough that a slope tells what more would do
@@ -363,7 +363,7 @@ def _outdone(tasks: Sequence[Task], races: Mapping[int, Raced], found: Mapping[i
     own = _undamped(fit.residuals, fit.jacobian * fit.problem.scaling.slope(fit.q))
     for k, race in races.items():
         nothing = race.reach > (1 - LITTLE) * own and race.cost > (1 - LITTLE) * fit.cost
-        if k not in found and (nothing or (race.reach > OUTDONE * costs[0] and race.cost not in costs[:BEAM])):
+        if k not in found and (nothing or (race.reach > OUTDONE * costs[0] and race.cost not in costs[:FINISHED])):
             given_up[k] = GivenUp(NOTHING if nothing else LESS, 1 - race.cost / max(fit.cost, 1e-300), (tasks[k], race))
     return given_up
 

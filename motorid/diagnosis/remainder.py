@@ -505,17 +505,16 @@ def _zeroed(base: Fit, zeros: Mapping[str, float]) -> Fit | None:
     return base if known else refit(base, base.model + PER_RUN["encoder_zero"], [zeros])
 
 
-def _grown_in(there: Fit | None, base: Fit, asked: Sequence[Form], quiet: bool = False) -> Iterator[tuple[Curve, Form]]:
-    """Yield curves, best first, of forms that grew in short windows or are `asked`; `quiet`: what leaves noise."""
+def _grown_in(there: Fit | None, base: Fit, asked: Sequence[Form]) -> Iterator[tuple[Curve, Form]]:
+    """Yield curves, best first, of forms that grew in short windows or are `asked`."""
     if there is not None:
         here, found = HeldOut.of(there, None), dict[Any, Grown]()
         also = ((Curve(there), f) for f in asked[:AHEAD] if not f.remembers and f.on not in ("distance", "run"))
-        before, tried = here.predictions(there), chain(islice(_beyond(there), TRIED), also)
-        _race(found, ((replace(curve, trial=True), form) for curve, form in tried), before, here, before)
-        for k, key in enumerate(sorted(found, key=lambda key: -found[key].gained.gain)):
-            begun, helps = replace(found[key].curve, trial=False), found[key].gained.worth_it and not (quiet and k)
-            whole = _zeroed_like(base, begun.fitted or begun.fit) if found[key].done or helps else None
-            if whole is not None:
+        tried = ((replace(curve, trial=True), form) for curve, form in chain(islice(_beyond(there), TRIED), also))
+        _race(found, tried, here.predictions(there), here, True)
+        for key in sorted(found, key=lambda key: -found[key].gained.gain):
+            begun = replace(found[key].curve, trial=False)
+            if found[key].gained.worth_it and (whole := _zeroed_like(base, begun.fitted or begun.fit)) is not None:
                 yield Curve(whole, name=_name(base), begun=begun), key[1]
 
 
@@ -600,12 +599,12 @@ def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions, held
 
 
 def _race(found: dict[Any, Grown], tried: Iterable[tuple[Curve, Form]], before: Predictions, held: HeldOut,
-          rival: Predictions | None = None) -> list[tuple[Curve, Form]]:
+          trial: bool = False) -> list[tuple[Curve, Form]]:
     """Put into `found` the curves, each with a form more: the first to its end, of the others those that get furthest
     with few functions (successive halving: Karnin, Koren & Somekh, ICML 2013), until one leaves nothing but noise.
 
-    Returns those that got furthest of all; none where one leaves nothing more. With a `rival` all have few functions,
-    and go on where these predict more than it.
+    Returns those that got furthest of all; none where one leaves nothing more. On `trial` all have few functions, and
+    the best goes on.
     """
     racing = dict[Any, Iterator[Grown]]()
 
@@ -620,28 +619,23 @@ def _race(found: dict[Any, Grown], tried: Iterable[tuple[Curve, Form]], before: 
         alike = {(c.fit.model.effect_names, f, c.begun is None) for c, f in racing}
         if (key[0].fit.model.effect_names, key[1], key[0].begun is None) not in alike:
             racing[key] = _grown(*key, True, before, held)
-            if quiet(key, TASTED if found or rival is not None else FEW):
+            if quiet(key, TASTED if found or trial else FEW):
                 return []
     ahead = sorted(found, key=lambda key: -found[key].gained.gain)
-    others = [key for key in ahead if key != next(iter(racing))] if rival is None else [
-        key for key in ahead if compare(rival, found[key].predictions).gain > 0]
-    return [] if any(quiet(key, FEW) for key in others[: 1 if rival is before else AHEAD]) else (
-        sorted(found, key=lambda key: -found[key].gained.gain)[:AHEAD])
+    others = ahead[:1] if trial else [key for key in ahead if key != next(iter(racing))][:AHEAD]
+    return [] if any(quiet(key, FEW) for key in others) else sorted(found, key=lambda k: -found[k].gained.gain)[:AHEAD]
 
 
-def alone_leaving_noise(last: Node, root: Fit, held: HeldOut, forms: Sequence[Form] = ()) -> FormGain | None:
-    """Return the form that, fitted in the place of all that `last` has and `root` has not, leaves noise and predicts
-    better, or leaves it in short windows where `root` loses itself; None for none. Raises OutOfTime."""
+def alone_predicting_more(last: Node, root: Fit, held: HeldOut, forms: Sequence[Form]) -> FormGain | None:
+    """Return the form that grew in short windows and in the place of all that `last` has and `root` has not predicts
+    better; None for none. Raises OutOfTime."""
     found = dict[Any, Grown]()
     check_time()
     with contextlib.suppress(*FAILURES):
-        there, before = _moments(root), held.predictions(root)
-        whole = (t for t in _beyond(root) if there is None or t[1].remembers)
-        _race(found, islice(chain(_grown_in(there, root, forms, True), whole), TRIED), before, held, last.predictions)
-    each = (FormGain(key[1], compare(last.predictions, f.predictions), f.predictions,
-                     f.done and f.curve.fitted is not None and len(f.curve.fitted.q) <= len(last.fit.q))
-            for key, f in found.items() if f.done or key[0].begun is not None)
-    return next((gain for gain in each if gain.evidence.worth_it), None)
+        tried = islice(_grown_in(_moments(root), root, forms), AHEAD)
+        _race(found, tried, held.predictions(root), held, True)
+    gains = (FormGain(key[1], compare(last.predictions, f.predictions), f.predictions) for key, f in found.items())
+    return next((gain for gain in gains if gain.evidence.worth_it), None)
 
 
 def beside_leaving_noise(last: Node, form: Form, special: Mapping[str, float], held: HeldOut) -> FormGain | None:
@@ -652,7 +646,7 @@ def beside_leaving_noise(last: Node, form: Form, special: Mapping[str, float], h
     for curve in (smaller and _instead(last.fit, smaller, form, special), Curve(last.fit, name=_name(last.fit))):
         if curve and (curve.begun or found or max(special.values()) > TRIFLE):
             grown = islice(_grown(curve, form, True, last.predictions, held), TASTED if curve.begun else None)
-            done = ((g, FormGain(form, g.gained, g.predictions, curve.fit is smaller, True)) for g in grown if g.done)
+            done = ((g, FormGain(form, g.gained, g.predictions, curve.fit is smaller)) for g in grown if g.done)
             found += [(len(g.curve.sizes) + len(curve.fit.q), gain) for g, gain in islice(done, 1)]
     return min(reversed(found), key=lambda entry: entry[0], default=(0, None))[1]
 

@@ -1,7 +1,7 @@
 """The loop: rank, refit the best, keep what lowers the held-out error, drop what has become superfluous, repeat.
 
-A beam of a few models is carried along, so that a wrong first choice (Coulomb where the friction grows with the
-load) can be overtaken, and after each addition the earlier effects are tried without.
+After each addition the earlier effects are tried without, and with others in their places, so that a wrong first choice
+(Coulomb where the friction grows with the load) can be overtaken.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.misspecification import IN_ITS_PLACE, FormGain, Grade, better_forms, differs, grades_of, outdoes
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of
 from motorid.diagnosis.predictive_score import QUICK, HeldOut, is_sure
-from motorid.diagnosis.refit import BEAM, BEHIND, INTERRUPTED, OUT_OF_TIME
-from motorid.diagnosis.remainder import alone_leaving_noise, beside_leaving_noise
+from motorid.diagnosis.refit import INTERRUPTED, OUT_OF_TIME
+from motorid.diagnosis.remainder import alone_predicting_more, beside_leaving_noise
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
-from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, MATERIAL, TRIFLE
+from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, MATERIAL, PLAIN, TRIFLE
 from motorid.diagnosis.verdict import first_answer
 from motorid.errors import OutOfTime, at_least, otherwise
 from motorid.estimation.fit import TOO_FAR, UNFOLLOWED, follows, growth, in_windows, solve
@@ -35,13 +35,13 @@ from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
 from motorid.numerics import parallel
+from motorid.problem.simulate import largest
 from motorid.records.experiment import Experiment, units_of
 
 ORDER = ("named", "group", "approximates")  # grades, the surest first
 FITTED_TOO = ("The fitted runs alone leave nothing but noise, and the model that they determine fails on the held-out "
               "ones: these were fitted, too, and none are left to judge by.")
 DRAWS_BACK = frozenset(("spring", "end_stop"))  # what drifts, whatever is missing
-HALF_AS_GOOD = 0.5  # of the best child's fall: what a second model must reach to be carried along
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,25 +101,24 @@ def climb(search: Search, max_effects: int, seconds: float | None = None, early:
 def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
     """Yield how far the loop is, after every step that may be the last."""
     search, best = found.search, found.path[-1]
-    frontier = [best]
     for k in range(2 * max_effects):  # what comes in the place of two leaves room for another
         search.stages.round(min(k + 1, max_effects))
         room = max_effects - len(best.key) + len(search.root.key)  # two effects may have come at once
         if room < 1 or (found.remaining.adequate and at_noise(best)):
             break
-        children, listed, stopped = _grown(search, frontier)
-        chosen = _better(children.values(), best)
+        (children, listed), stopped = search.expand(best), search.stopped
+        chosen = _better(children, best)
         if room > 1 and not stopped and far(best.fit):
             pairs = [] if chosen else search.expand_by_two(best)
-            refused = _outdoing(listed, list(children.values()), best, chosen and chosen[0])
+            refused = _outdoing(listed, children, best, chosen and chosen[0])
             pairs += search.expand_from(best, refused) if refused is not None and not search.stopped else []
-            children |= {c.key: c for c in pairs}
+            children = [*children, *pairs]
             chosen, stopped = _better(pairs, best) or chosen, search.stopped
         found = replace(found, rounds=(*found.rounds, tuple(listed)), stopped=stopped)
-        search.nodes |= children
+        search.nodes |= {c.key: c for c in children}
         while chosen is not None:
             new, ordered = chosen
-            yield _with(found, new, new, new.parent is frontier[0], ())
+            yield _with(found, new, new, new.parent is best, ())
             if stopped:
                 return
             search.nodes[new.key] = new = search.brought_to_its_end(new)
@@ -133,28 +132,13 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
         pruned = pruned if pruned is new else search.brought_to_its_end(pruned)
         chosen_of = pruned if pruned.added != new.added and pruned.parent is new.parent else new
         group = group_of(chosen_of, ordered, {e.name: e.includes for e in search.effects})
-        found = _with(found, pruned, chosen_of, new.parent is frontier[0], group)
-        found = replace(found, remaining=judge_adequacy(pruned, search.scores(pruned)))
-        others = map(search.brought_to_its_end, _runners_up(pruned, ordered, search.effects))
-        best, frontier = pruned, [pruned, *others]
+        found = _with(found, pruned, chosen_of, new.parent is best, group)
+        found, best = replace(found, remaining=judge_adequacy(pruned, search.scores(pruned))), pruned
         search.stages.done(f"accepted {chosen_of.added}")
         yield found
     done = found.remaining.adequate and at_noise(best)
     yield replace(found, text="stopped: what remains is noise" if done
                   else f"stopped at the limit of {max_effects} effects")
-
-
-def _grown(search: Search, frontier: Sequence[Node]) -> tuple[dict[frozenset[str], Node], list[Candidate], str]:
-    """Return the children of all models of a round, the candidates of the first, and why it ended early, if it did."""
-    children: dict[frozenset[str], Node] = {}
-    first: list[Candidate] = []
-    for node in frontier:
-        grown, listed = search.expand(node)
-        first = first or listed
-        children |= {c.key: c for c in grown if c.key not in children}
-        if search.stopped or any(at_noise(c) and not c.objection for c in grown):  # no other branch can leave less
-            break
-    return children, first, search.stopped
 
 
 def _with(found: Climb, best: Node, chosen: Node, ranked: bool, group: tuple[str, ...]) -> Climb:
@@ -195,23 +179,20 @@ def _still_alike(found: Climb) -> tuple[tuple[tuple[str, ...], ...], tuple[Fit, 
 
 
 def _beside_curves(found: Climb) -> Climb:
-    """Return a climb with grades that hold beside a curve, fitted in the place of all that was found, or beside an
-    effect that is a special case of it. Forms are compared by slopes, and these lead astray far from the records."""
+    """Return a climb with grades that hold beside the curve that leads, fitted beside an effect that is a special case
+    of it, or in its place; where the error is plain to see, also beside one in the place of all that was found. Forms
+    are compared by slopes, and these lead astray far from the records."""
     search, best, grades = found.search, found.path[-1], list(found.grades)
-    noise = found.remaining.adequate and at_noise(best)  # on held-out runs, too
-    if noise or all(g.grade == "approximates" for g in grades):
+    if (found.remaining.adequate and at_noise(best)) or all(g.grade == "approximates" for g in grades):
         return found
-    forms = [gain.form for gain in found.forms]
-    special = {e.name: share for form in forms[:1] for e in best.fit.model.effects if e.name not in search.root.key
-               and (share := differs(best.fit, form, e)) is not None}
-    beside = beside_leaving_noise(best, forms[0], special, search.held) if special else None
-    curve = beside if beside and beside.smaller else alone_leaving_noise(best, search.root.fit, search.held, forms)
-    if (curve := curve or beside) is None:
-        return found
+    special = {e.name: share for gain in found.forms[:1] for e in best.fit.model.effects
+               if e.name not in search.root.key and (share := differs(best.fit, gain.form, e)) is not None}
+    curve = beside_leaving_noise(best, found.forms[0].form, special, search.held) if special else None
+    if not (curve and curve.smaller) and largest(best.fit.nrmse) > PLAIN and (
+            alone := alone_predicting_more(best, search.root.fit, search.held, [gain.form for gain in found.forms])):
+        curve, special = alone, dict.fromkeys(best.key, np.inf)
     for k, g in enumerate(grades):
-        if g.grade != "approximates" and (smaller := search.without(best, g.effect)) is not None and (
-                special.get(g.effect, 0.0) > (0.0 if curve.smaller else TRIFLE) if curve.beside else
-                curve.smaller or outdoes(evidence(smaller, best).fall, curve.evidence.fall)):
+        if curve and g.grade != "approximates" and special.get(g.effect, 0.0) > (0.0 if curve.smaller else TRIFLE):
             grades[k] = Grade(g.effect, "approximates", IN_ITS_PLACE.format(curve.form.text), curve.form)
             found = replace(found, remaining=following(found.remaining, curve.form.text))
     return replace(found, grades=tuple(grades))
@@ -484,20 +465,6 @@ def _late_reading(path: Sequence[Node]) -> versions.Reading | None:
     fits = (path[k].fit for k in dict.fromkeys((plain, len(path) - 1)))
     asked = (versions.better_reading(fit, late=True) for fit in fits if far(fit) and follows(fit))
     return next((reading for reading in asked if reading is not None), None)
-
-
-def _runners_up(best: Node, ordered: Sequence[Node], effects: Sequence[Effect]) -> list[Node]:
-    """Return the next best child if it came near enough to be grown too, as one of another kind than the best.
-
-    Near is half as far as the best came, and no more than a few times its error. What contains the best's effect and
-    predicts no better is none: every later round tries it in that one's place.
-    """
-    if best.parent is None:
-        return []
-    goal, wider = evidence(best.parent, best).fall, {e.name for e in effects if best.added in e.includes}
-    least = max(HALF_AS_GOOD * goal, 1 - np.sqrt(BEHIND) * (1 - goal))
-    near = (n for n in ordered if n.key != best.key and evidence(best.parent, n).fall > least)
-    return [n for n in [*near][:BEAM - 1] if not (n.added in wider or n.key > best.key) or beats(n, best)]
 
 
 def _marked(listed: Sequence[Candidate], node: Node, group: tuple[str, ...]) -> tuple[Candidate, ...]:

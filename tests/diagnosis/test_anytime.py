@@ -186,17 +186,14 @@ def test_what_comes_in_the_place_of_two_leaves_room_for_another(monkeypatch):
     def node(key=frozenset()):
         return SimpleNamespace(key=key, added=max(key, default=None), fit=None, parent=None)
 
-    def grown(search, frontier):
-        child = node(next(keys))
-        return {child.key: child}, [], ""
-
     stages = SimpleNamespace(round=lambda k: None, done=lambda words: None)
     search = SimpleNamespace(root=node(), stages=stages, effects=(), nodes={}, brought_to_its_end=lambda new: new,
+                             expand=lambda best: ([node(next(keys))], []), stopped="",
                              pruned=lambda new, best: new, scores=lambda new: [],
                              exchanged=lambda new, best: new)
-    for name, instead in {"at_noise": lambda best: False, "far": lambda fit: [], "_grown": grown,
+    for name, instead in {"at_noise": lambda best: False, "far": lambda fit: [],
                           "_better": lambda some, best: (next(iter(some)), list(some)), "group_of": lambda *_: (),
-                          "judge_adequacy": lambda *_: SimpleNamespace(adequate=False), "_runners_up": lambda *_: [],
+                          "judge_adequacy": lambda *_: SimpleNamespace(adequate=False),
                           "_with": lambda found, best, *_: replace(found, path=(*found.path, best))}.items():
         monkeypatch.setattr(stepwise, name, instead)
     begun = stepwise.Climb(search, (search.root,), (), (), "", None, SimpleNamespace(adequate=False))
@@ -205,28 +202,18 @@ def test_what_comes_in_the_place_of_two_leaves_room_for_another(monkeypatch):
     assert last.text == "stopped at the limit of 3 effects"
 
 
-@pytest.mark.parametrize(("leaves", "grown"), [("noise", 1), ("more", 2), ("noise against physics", 2)])
-def test_a_second_branch_is_grown_only_where_the_first_leaves_more_than_noise(monkeypatch, leaves, grown):
-    expanded = []
-    child = SimpleNamespace(key=frozenset("ab"), objection="a wrong sign" if leaves == "noise against physics" else "")
-    search = SimpleNamespace(expand=lambda node: (expanded.append(node) or [child], []), stopped="")
-    monkeypatch.setattr(stepwise, "at_noise", lambda node: leaves != "more")
-    children, _, stopped = stepwise._grown(search, ["first", "second"])
-    assert len(expanded) == grown
-    assert children == {child.key: child}
-    assert not stopped
-
-
 @pytest.mark.parametrize("noise", [True, False])
 def test_curves_are_asked_where_held_out_runs_hold_more_than_noise(monkeypatch, noise):
     """A battery that polarises was fitted to its noise by three effects, and missed by three times that elsewhere."""
     asked = []
     monkeypatch.setattr(stepwise, "at_noise", lambda best: noise)
-    monkeypatch.setattr(stepwise, "alone_leaving_noise", lambda *_: asked.append(best))
-    search, best = SimpleNamespace(root=SimpleNamespace(fit=None), held=None), SimpleNamespace(fit=None)
+    monkeypatch.setattr(stepwise, "beside_leaving_noise", lambda *_: asked.append(best))
+    monkeypatch.setattr(stepwise, "differs", lambda *_: 0.2)
+    search = SimpleNamespace(root=SimpleNamespace(fit=None, key=()), held=None)
+    best = SimpleNamespace(fit=SimpleNamespace(model=mi.dc_motor() + mi.effects.winding_heating, nrmse={"i": 0.02}))
     found = stepwise.Climb(search, (best,), (), (), "", None, SimpleNamespace(adequate=True),
-                           grades=(Grade("winding_heating", "named"),))
-    assert stepwise._beside_curves(found) is found
+                           (SimpleNamespace(form=None),), (Grade("winding_heating", "named"),))
+    assert stepwise._beside_curves(found).grades == found.grades
     assert bool(asked) is not noise
 
 

@@ -436,7 +436,6 @@ def test_a_driver_that_limits_the_current_is_no_effect_of_the_motor(monkeypatch)
     monkeypatch.setattr(grades, "current_limit", lambda run: None)
     monkeypatch.setattr(grades, "better_forms", lambda fit, rival: [])
     monkeypatch.setattr(stepwise, "better_forms", lambda fit, rival: [])
-    monkeypatch.setattr(stepwise, "alone_leaving_noise", lambda *given: None)
     assert mi.diagnose(fit, runs[2:], effects=tried).effects  # the bait
     free = [limited(1e9, k, volts) for k, volts in enumerate(drives[:2])]
     assert "current limit" not in mi.diagnose(mi.fit(mi.dc_motor(), free), effects=tried).text

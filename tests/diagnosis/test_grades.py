@@ -25,10 +25,10 @@ from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.candidates import library
 from motorid.diagnosis.free_forms import Form
 from motorid.diagnosis.misspecification import FormGain, Grade
-from motorid.diagnosis.model_comparison import node_of, tied
+from motorid.diagnosis.model_comparison import node_of
 from motorid.diagnosis.predictive_score import Evidence, HeldOut, Predictions
 from motorid.diagnosis.results import Candidate
-from motorid.diagnosis.stepwise import _outdoing, _runners_up
+from motorid.diagnosis.stepwise import _outdoing
 from motorid.effects import LIBRARY
 
 HIDDEN = {"coulomb": {"tau_c": 8e-3}}
@@ -284,21 +284,6 @@ def test_friction_that_differs_by_a_trifle_with_the_direction_is_friction(rubbin
         assert bool(said) == ("sizes differ" in objections(alike, mi.effects.coulomb_asymmetric))
 
 
-def test_a_model_that_ties_with_the_best_is_grown_too_unless_it_contains_it(rubbing):
-    """Which of them is right may show only with the next effect; what contains it is tried in its place anyway."""
-    plain, check = rubbing
-    held, root = HeldOut.of(plain, check), node_of(plain, HeldOut.of(plain, check))
-    best, wider, worse = (node_of(mi.fit(plain.model + e, plain.problem.experiments), held, e.name, root)
-                          for e in (mi.effects.coulomb, mi.effects.coulomb_asymmetric, mi.effects.constant_load))
-    assert tied(best, wider)
-    assert _runners_up(best, [best, wider, worse], [mi.effects.constant_load]) == [wider]
-    assert _runners_up(best, [best, wider, worse], library(None)) == []
-    both = node_of(mi.fit(best.fit.model + mi.effects.constant_load, plain.problem.experiments), held, "constant_load",
-                   root)
-    assert tied(best, both)
-    assert _runners_up(best, [best, both], []) == [], "it is the best with what was superfluous"
-
-
 @pytest.mark.parametrize(("law", "noise", "chosen"), [
     (0.86, False, "law"), (0.60, False, "own"), (0.86, True, "own")])
 def test_one_law_for_all_runs_comes_before_sizes_of_every_runs_own(monkeypatch, law, noise, chosen):
@@ -342,15 +327,6 @@ def test_beside_what_physics_speaks_against_its_simpler_kin_is_tried(rubbing, mo
     children, listed = search.expand(search.root)
     assert {c.added: bool(c.objection) for c in children} == {"stribeck": True, "coulomb": False}
     assert next(c for c in listed if c.effect == "coulomb").fit is not None
-
-
-def test_a_rival_with_several_times_the_error_of_the_best_is_not_grown(monkeypatch):
-    """Both explain most: 3 % of the error is left by the best, 7 and 11 % by the others."""
-    falls = {"best": 0.97, "near": 0.93, "far": 0.89}
-    best, near, far = (SimpleNamespace(key=frozenset({n}), added=n, parent="root") for n in falls)
-    monkeypatch.setattr(stepwise, "evidence", lambda before, node: SimpleNamespace(fall=falls[node.added]))
-    assert _runners_up(best, [best, near, far], []) == [near]
-    assert _runners_up(best, [best, far], []) == []
 
 
 @pytest.mark.parametrize(("gain", "said"), [(1e4, True), (1.0, False)])
@@ -445,8 +421,6 @@ def test_what_a_wider_law_beside_it_explains_to_the_noise_approximates(monkeypat
     """A spring that hardens: stops do 95 % of what it does, and a curve over the angle the rest."""
     form = next(f for f in free_forms.FORMS if (f.words, f.on) == ("a load", "theta"))
     monkeypatch.setattr(free_forms, "FORMS", (form,))
-    monkeypatch.setattr(stepwise, "alone_leaving_noise", lambda *given: None)
-
     motor = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=4e-4, J=2e-4) + hardening(k_h=1e-5)
     runs = [stepped(motor, 10 * seed + k, 600, 5e-3, 3.0, theta=2e-3) for k in range(3)]
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("end_stop",))
@@ -457,8 +431,6 @@ def test_what_a_wider_law_beside_it_explains_to_the_noise_approximates(monkeypat
 
 def test_what_a_smaller_law_in_the_place_of_all_its_cases_leaves_as_noise_is_not_named(monkeypatch):
     """Stops, a spring and a weight for a spring that hardens: the curve begins as what all three do together."""
-    monkeypatch.setattr(stepwise, "alone_leaving_noise", lambda *given: None)
-
     motor = mi.dc_motor(R=1.1, L=3e-3, K=0.57, b=0.0167, J=0.036) + hardening(k_h=0.029)
     runs = [stepped(motor, 30 + k, 800, 5e-3, 12.0, theta=2e-2, i=0.03) for k in range(3)]
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("end_stop", "spring", "gravity"))

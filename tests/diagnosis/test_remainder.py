@@ -897,28 +897,15 @@ def run_in(m, tau=mi.P(2e-2, "N·m", null=0.0)):
     m.torque -= tau * m.sign(m.omega) * ca.exp(-distance / 40)
 
 
-def test_what_a_curve_alone_leaves_as_noise_is_not_named(lab, monkeypatch):
-    """Where slopes do not say so, the curve does that is fitted; interrupted while that is, all else is kept."""
-    runs, _ = _with_law(run_in, ANGLE[:2], lab)
-    fit = mi.fit(mi.dc_motor(), runs[:2])
-    for slopes in (grades, stepwise):
-        monkeypatch.setattr(slopes, "better_forms", lambda *given: [])
-    found = mi.diagnose(fit, runs[2:], effects=("coulomb",))
-    assert (found.verdict, found.effects) == ("unexplained", ())
-    assert "a friction that changes with the distance run, which the library lacks" in found.ladder.rungs[1].why
-    judge = stepwise.judge_adequacy
-    with monkeypatch.context() as patch:  # also where no slope predicts what is larger than the noise
-        patch.setattr(stepwise, "judge_adequacy", lambda node, *scores: replace(
-            judge(node, *scores), adequate=node.parent is not None))
-        found = mi.diagnose(fit, runs[2:], effects=("coulomb",))
-    assert (found.verdict, found.remainder.kind) == ("unexplained", "structure")
-    assert "follow a friction that changes with the distance run" in found.text
-
+def test_what_is_found_is_kept_where_the_look_at_curves_beside_it_is_interrupted(lab, monkeypatch):
     def interrupted(*given):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(stepwise, "alone_leaving_noise", interrupted)
-    found = mi.diagnose(fit, runs[2:], effects=("coulomb",))
+    runs, _ = _with_law(run_in, ANGLE[:2], lab)
+    for slopes in (grades, stepwise):
+        monkeypatch.setattr(slopes, "better_forms", lambda *given: [])
+    monkeypatch.setattr(stepwise, "_beside_curves", interrupted)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb",))
     assert (found.verdict, found.effects, found.stopped) == ("missing", ("coulomb",), "interrupted")
 
 
