@@ -17,17 +17,7 @@ import numpy as np
 from motorid.diagnosis.admissibility import MELTS, hottest, objections
 from motorid.diagnosis.free_forms import own_levels
 from motorid.diagnosis.misspecification import LIMITER
-from motorid.diagnosis.model_comparison import (
-    COMMON,
-    Node,
-    at_noise,
-    beats,
-    evidence,
-    far,
-    node_of,
-    preferred,
-    superfluous,
-)
+from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, preferred, superfluous
 from motorid.diagnosis.predictive_score import QUICK, Evidence, HeldOut, deciding
 from motorid.diagnosis.refit import LITTLE, STOPPED, GivenUp, Task, completed, hidden_in, led_on, refit, refits, widened
 from motorid.diagnosis.results import Candidate
@@ -312,7 +302,7 @@ class Search:
             smaller = simpler if alone else [*simpler, *_without(node.fit.model, e.name)]
             for model in sorted(smaller, key=lambda m: len(m.free_names)):
                 other = self.smaller(node, model)
-                if other and len(other.key - self.root.key) > 1 and at_noise(node) and far(other.fit):
+                if other and len(other.key - self.root.key) > 1 and far(other.fit) and not far(node.fit):
                     # The larger one's values, or the few steps of a race, may have led into a valley of its own.
                     first = {p.name: p.value for e in other.fit.model.effects for p in e.parameters if p.vary}
                     other = self._fitted(other, other.fit.model.start_at(first), "auto")
@@ -351,8 +341,9 @@ class Search:
             fit = solve(problem := node.fit.problem.with_(model=model, noise_factors={}), QUICK, start=start)
             if fit.status == "limit":  # on its way still
                 fit = solve(problem.with_(model=fit.model), RACE, start="model")
-            onward = replace(node, fit=fit, predictions=self.held.predictions(fit), objection=next(
-                (why for e in fit.model.effects if e.name not in self.root.key and (why := objections(fit, e))), ""))
+            against = (objections(fit, e, self.root.fit) for e in fit.model.effects if e.name not in self.root.key)
+            why, predictions = next(filter(None, against), ""), self.held.predictions(fit)
+            onward = replace(node, fit=fit, predictions=predictions, objection=why)
             if beats(onward, node) and hottest(fit) <= MELTS:
                 self.nodes[node.key] = node = onward
         return node

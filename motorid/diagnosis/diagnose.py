@@ -108,8 +108,8 @@ def _told(found: Climb, misread: str, driven: str, validated: bool, records: Seq
     missing = acting_like(missing, like) if like is not None and not names else missing
     if names:
         verdict, where = "missing", WHERE[{e.name: e.balance for e in ladder.best.model.effects}[names[0]]]
-        answer = words.missing_text(ladder.rungs, remaining, groups, graded,
-                                    bool(words.held_out_remark(last)), found.stopped)
+        elsewhere = bool(words.held_out_remark(last))
+        answer = words.missing_text(ladder.rungs, remaining, groups, graded, elsewhere, found.stopped)
         same = _inseparable(found, ladder.best.model)
         details = [words.moves(fit, ladder.best), words.rises_text(ladder.rungs), words.inseparable_remark(same),
                    words.hidden_remark(found.search.hidden(last)),
@@ -153,8 +153,8 @@ def _remarks(found: Climb, driven: str) -> list[str]:
     late = "" if set(last.problem.outputs) != {"omega"} or "speed_delay" not in found.path[-1].key else (
         f"The speed alone cannot tell a late sensor from a voltage that acts late: --delay {last.values['T_d']:.3g}.")
     stopped = f"Stopped early: {found.stopped}; more may be missing." if found.stopped else ""
-    half = [f"'{g.effect}' in the model is no effect that was missing: {DIFFERENCED}."
-            for g in found.grades if g.why == DIFFERENCED]
+    half = (f"'{g.effect}' in the model is no effect that was missing: {g.why}." for g in found.grades
+            if g.why == DIFFERENCED)
     own = words.own_in_every_run_remark(last) if found.search.held.validation is not None else ""
     return [stopped, driven, *half, windows, late, next(limits, ""), parts_remark(first),
             words.unfinished_remark(last), words.held_out_remark(found.path[-1]), own,

@@ -304,9 +304,10 @@ def _half_a_sample(fit: Fit, effect: Effect) -> bool:
     """Tell whether an effect makes the speed late by half a sample of the records: so is the mean over each."""
     if effect.name not in LATENESS:
         return False
-    run, name = fit.problem.experiments[0], effect.parameters[0].name
-    half, late = float(np.median(np.diff(run.t))) / run.meta.get("every", 1) / 2, LATENESS[effect.name]
-    return abs(late * fit.values[name] - half) < max(TRIFLE * half, STANDARD_ERRORS * late * (fit.std[name] or 0.0))
+    run, name, share = fit.problem.experiments[0], effect.parameters[0].name, LATENESS[effect.name]
+    half = 0.5 * float(np.median(np.diff(run.t))) / run.meta.get("every", 1)
+    late, unsure = share * fit.values[name], STANDARD_ERRORS * share * (fit.std.get(name) or 0.0)
+    return abs(late - half) < max(TRIFLE * half, min(unsure, half))
 
 
 def _within_smoothing(fit: Fit, effect: Effect) -> str:
