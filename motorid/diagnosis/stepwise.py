@@ -188,7 +188,8 @@ def _beside_curves(found: Climb) -> Climb:
     special = {e.name: share for gain in found.forms[:1] for e in best.fit.model.effects
                if e.name not in search.root.key and (share := differs(best.fit, gain.form, e)) is not None}
     curve = beside_leaving_noise(best, found.forms[0].form, special, search.held) if special else None
-    if not (curve and curve.smaller) and largest(best.fit.nrmse) > PLAIN and (
+    elsewhere = {c: e.nrmse for c, e in best.predictions.held_out.items()}
+    if not (curve and curve.smaller) and max(largest(best.fit.nrmse), largest(elsewhere)) > PLAIN and (
             alone := alone_predicting_more(best, search.root.fit, search.held, [gain.form for gain in found.forms])):
         curve, special = alone, dict.fromkeys(best.key, np.inf)
     for k, g in enumerate(grades):

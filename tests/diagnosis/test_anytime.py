@@ -210,7 +210,8 @@ def test_curves_are_asked_where_held_out_runs_hold_more_than_noise(monkeypatch, 
     monkeypatch.setattr(stepwise, "beside_leaving_noise", lambda *_: asked.append(best))
     monkeypatch.setattr(stepwise, "differs", lambda *_: 0.2)
     search = SimpleNamespace(root=SimpleNamespace(fit=None, key=()), held=None)
-    best = SimpleNamespace(fit=SimpleNamespace(model=mi.dc_motor() + mi.effects.winding_heating, nrmse={"i": 0.02}))
+    best = SimpleNamespace(fit=SimpleNamespace(model=mi.dc_motor() + mi.effects.winding_heating, nrmse={"i": 0.02}),
+                           predictions=SimpleNamespace(held_out={}))
     found = stepwise.Climb(search, (best,), (), (), "", None, SimpleNamespace(adequate=True),
                            (SimpleNamespace(form=None),), (Grade("winding_heating", "named"),))
     assert stepwise._beside_curves(found).grades == found.grades
