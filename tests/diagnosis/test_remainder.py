@@ -897,11 +897,16 @@ def run_in(m, tau=mi.P(2e-2, "N·m", null=0.0)):
     m.torque -= tau * m.sign(m.omega) * ca.exp(-distance / 40)
 
 
-def test_what_is_found_is_kept_where_the_look_at_curves_beside_it_is_interrupted(lab, monkeypatch):
+def test_dry_friction_that_dies_out_with_the_distance_run_is_not_named(lab, monkeypatch):
+    """Unless no slope tells that curve and the look at others is interrupted: what was found then is kept."""
     def interrupted(*given):
         raise KeyboardInterrupt
 
     runs, _ = _with_law(run_in, ANGLE[:2], lab)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb",))
+    assert (found.verdict, found.effects, found.remainder.kind) == ("unexplained", (), "structure")
+    assert "a friction that changes with the distance run, which the library lacks" in found.ladder.rungs[1].why
+    assert "follow a friction that changes with the distance run" in found.text
     for slopes in (grades, stepwise):
         monkeypatch.setattr(slopes, "better_forms", lambda *given: [])
     monkeypatch.setattr(stepwise, "_beside_curves", interrupted)
