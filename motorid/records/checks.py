@@ -589,11 +589,12 @@ def magnitudes(run: Experiment) -> str | None:
                 return (f"v reaches {top:.5g} V{was}: is the column a duty cycle, in per cent or in counts of a timer? "
                         f"Then give the voltage of one: units={{'v': '{one:.2g} V'}}.")
             return f"{channel} reaches {top:.4g} {unit}{was}; {_remedy(run, channel, likely)}"
-    if run.dt > 0.2:
-        likely = "ms" if run.dt < 200 else "us"
-        return (f"there are {run.dt:.3g} s between samples, too long for a motor; is the time in {likely}? "
-                f"If so: units={{'t': '{likely}'}}.")
-    return f"there are only {run.dt:.3g} s between samples; is the unit of the time right?" if run.dt < 1e-6 else None
+    if 1e-6 <= run.dt <= 0.2:
+        return None
+    raw = run.dt / (known.factor if (known := parse_unit(stated.get("t", "s"))) else 1.0)
+    unit = next((u for u, size in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)) if 1e-5 < raw * size < 0.2), "")
+    asked = f"is the time in {unit}? If so: units={{'t': '{unit}'}}." if unit else "is the unit of the time right?"
+    return f"there are {'only ' * (run.dt < 1e-6)}{run.dt:.3g} s between samples, which suits no motor; {asked}"
 
 
 def _remedy(run: Experiment, channel: str, likely: str) -> str:

@@ -2,13 +2,14 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motorid.display.numbers import counted
-from motorid.errors import DataError
+from motorid.errors import DataError, otherwise
 from motorid.numerics.signals import Array, repeats
 from motorid.records.experiment import INPUTS, MIN_SAMPLES, PARTS, Experiment, pauses
 from motorid.records.layout import Layout, Place
@@ -16,6 +17,7 @@ from motorid.records.preprocessing import unwrapped
 
 Texts = Mapping[str, Sequence[object]]
 
+_RUNS = ("run", "run_id", "trial", "test", "experiment", "motor", "motor_id", "messung", "versuch", "essai")
 _LATE = 2  # this many rows in a row may come late before it counts as a new start of time
 
 
@@ -35,12 +37,11 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     empty = [c for c, a in values.items() if np.isnan(a).all()]
     said += [f"left out '{places[c].column}' ({c}): every sample is missing." for c in empty]
     inputs = {c: _filled_forward(values[c], places[c].column, said) for c in INPUTS if c in values and c not in empty}
-    values = {c: a for c, a in values.items() if c not in INPUTS}
-    outputs = {c: a for c, a in values.items() if c not in empty}
+    outputs = {c: a for c, a in values.items() if c not in (*INPUTS, *empty)}
     said += [f"'{places[c].column}' ({c}) is missing in {np.count_nonzero(np.isnan(a))} of {len(a)} rows."
              for c, a in outputs.items() if np.isnan(a).any()]
     if not outputs:
-        raise DataError(f"every sample of {', '.join(repr(places[c].column) for c in values)} is "
+        raise DataError(f"every sample of {', '.join(repr(places[c].column) for c in values if c not in INPUTS)} is "
                         "missing; there is nothing measured to fit.")
     for part in np.split(np.arange(len(t)), np.searchsorted(t, begun)):
         _note_gaps(t[part], said)
@@ -56,7 +57,8 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     extra = {c: a[rows] for c, a in columns.items() if c not in used}
     if set(texts) - used:
         said.append(f"left out columns of text: {', '.join(sorted(set(texts) - used))}.")
-    begins = {PARTS[0]: begun, PARTS[1]: np.subtract(meta.get("parts", ()), np.median(np.diff(t)) / 2)}
+    parts = [*meta.get("parts", ()), *_runs_by_column({**texts, **columns}, rows, t, said)]
+    begins = {PARTS[0]: begun, PARTS[1]: np.subtract(parts, np.median(np.diff(t)) / 2)}
     extra |= {c: np.searchsorted(times, t, "right") for c, times in begins.items() if len(times)}
     facts = {**meta, "notes": said, "extra": extra, "columns": {c: p.column for c, p in layout.places.items()},
              "original_units": {c: p.unit.label for c, p in layout.places.items()},
@@ -102,19 +104,20 @@ def _time(columns: Mapping[str, Array], texts: Texts, place: Place, said: list[s
 def _dates(cells: Sequence[object], column: str) -> Array:
     import pandas as pd
 
-    series = pd.Series(cells, dtype=object)
+    series = pd.Series(cells, dtype=object).astype(str).str.strip()
+    series = series.str.replace(r"(:\d\d)[,:](\d+)$", r"\1.\2", regex=True)  # 12:00:00,001
+    # Bare numbers would be nanoseconds; a spreadsheet may leave out the hours.
+    clock = series.where(series.str.contains("[:a-zA-Z]")).str.replace(r"^(\d+:\d\d\.\d)", r"00:\1", regex=True)
+    ways = (partial(pd.to_datetime, series, format="ISO8601", utc=True), partial(pd.to_timedelta, clock),
+            partial(pd.to_datetime, clock, format="mixed", utc=True, dayfirst="." in str(cells[0])[:3]))
     with warnings.catch_warnings(action="ignore"):
-        try:
-            stamps = pd.to_datetime(series, errors="coerce", format="ISO8601", utc=True)
-            clock = series.where(series.astype(str).str.contains("[:a-zA-Z]"))  # bare numbers would be nanoseconds
-            spans = stamps if stamps.notna().mean() > 0.5 else pd.to_timedelta(clock, errors="coerce")
-            seconds = (spans - spans.min()).dt.total_seconds().to_numpy(dtype=float)
-        except (ValueError, TypeError, OverflowError, AttributeError):
-            seconds = np.full(len(series), np.nan)
-    if np.isnan(seconds).mean() > 0.5:
-        raise DataError(f"the time column '{column}' holds neither numbers nor dates, e.g. "
-                        f"'{str(cells[0])[:40]}'; expected seconds, or another unit that is stated.")
-    return seconds
+        for way in ways:
+            spans: Any = otherwise(None, (ValueError, TypeError, OverflowError), lambda way=way: way(errors="coerce"))
+            if spans is not None and spans.notna().mean() > 0.5:
+                seconds = (spans - spans.dropna().iloc[0]).dt.total_seconds().to_numpy(dtype=float)
+                return np.unwrap(seconds, period=86400.0) if np.isfinite(seconds).all() else seconds  # past midnight
+    raise DataError(f"the time column '{column}' holds neither numbers nor dates, e.g. '{str(cells[0])[:40]}'; "
+                    "expected seconds, or another unit that is stated. Samples a fixed time apart: dt=0.001.")
 
 
 def _rows_in_order(t: Array, column: str, said: list[str]) -> tuple[NDArray[np.intp], Array, list[float]]:
@@ -147,8 +150,8 @@ def _rows_in_order(t: Array, column: str, said: list[str]) -> tuple[NDArray[np.i
     kept = sum(map(len, moving))
     if kept < max(total / 2, MIN_SAMPLES):
         raise DataError(f"time stands still or goes back in {total - kept} of {total} rows of "
-                        f"'{column}'. Is it the right column? If its clock is too coarse, number the rows "
-                        "and say the step, e.g. columns={'t': 'row'}, units={'t': '0.0002 s'}.")
+                        f"'{column}'. Is it the right column? If its clock is too coarse, leave "
+                        "it out, and say the time between samples: dt=0.0002.")
     if kept < total:
         said.append(f"left out {counted(total - kept, 'row')} of {total}: the time stamp repeats "
                     "an earlier one, goes back, or jumps ahead.")
@@ -170,6 +173,18 @@ def _stretches(t: Array) -> list[NDArray[np.intp]]:
             cuts.append(k)
             high = -np.inf
     return np.split(np.arange(len(t)), cuts)
+
+
+def _runs_by_column(columns: Mapping[str, Any], rows: NDArray[np.intp], t: Array, said: list[str]) -> list[float]:
+    """Return the times at which a column that numbers or names runs changes; none where it does so all the time."""
+    if (name := next((c for c in columns if c.strip().lower() in _RUNS), None)) is None:
+        return []
+    every = np.asarray(columns[name], dtype=str)
+    often, changes = (np.flatnonzero(cells[1:] != cells[:-1]) + 1 for cells in (every, every[rows]))
+    seldom = len(often) <= len(every) / MIN_SAMPLES
+    said += [f"a new run begins {counted(len(changes), 'time')}, where '{name}' changes." if seldom else
+             f"'{name}' changes in {len(often)} rows: several at once? Split the file by it."] * bool(len(often))
+    return list(map(float, t[changes])) if seldom else []
 
 
 def _first_input(v: Array, column: str, said: list[str]) -> int:

@@ -25,11 +25,11 @@ _DEGREE = math.pi / 180
 _SPELLINGS = {
     "time": {1.0: "s sec secs second seconds sek sekunde sekunden", 1e-3: "ms msec millis millisecond milliseconds",
              1e-6: "us usec micros microsecond microseconds", 1e-9: "ns nanoseconds", 60.0: "min minute minutes",
-             3600.0: "h hour hours"},
+             3600.0: "h hour hours", 86400.0: "d day days"},
     "voltage": {1.0: "v volt volts", 1e-3: "mv millivolt millivolts", 1e3: "kv"},
     "current": {1.0: "a amp amps ampere amperes", 1e-3: "ma milliamp milliamps milliampere", 1e-6: "ua", 1e3: "ka"},
     "speed": {1.0: "rad/s rad/sec rad/second rads rads-1 radps", 1e-3: "mrad/s", 1e3: "krad/s",
-              _TURN / 60: "rpm 1/min u/min upm umin tr/min min-1 rev/min r/min turns/min umdr/min",
+              _TURN / 60: "rpm 1/min u/min upm umin tr/min tr/mn min-1 rev/min r/min turns/min umdr/min",
               1e3 * _TURN / 60: "krpm", _TURN: "rev/s rps turn/s turns/s hz r/s u/s tr/s",
               _DEGREE: "deg/s deg/sec dps degps degs-1 degree/s degrees/s grad/s"},
     "linear speed": {1.0: "m/s ms-1 meter/s meters/s", 1e-2: "cm/s", 1e-3: "mm/s"},
@@ -37,18 +37,18 @@ _SPELLINGS = {
               _TURN: "rev revs revolution revolutions turn turns tr umdrehungen"},
     "length": {1.0: "m meter meters metre metres", 1e-2: "cm", 1e-3: "mm", 1e-6: "um"},
     "torque": {1.0: "nm", 1e-3: "mnm", 1e-2: "ncm"}, "force": {1.0: "n newton", 1e3: "kn"},
-    "ratio": {1.0: "1 -", 1e-2: "% percent"}, "temperature": {1.0: "degc celsius c k kelvin"}}
+    "ratio": {1.0: "1 -", 1e-2: "% percent", 1e-3: "‰"}, "temperature": {1.0: "degc celsius c k kelvin"}}
 _KNOWN = {word: (dimension, factor) for dimension, sizes in _SPELLINGS.items()
           for factor, words in sizes.items() for word in words.split()}
 _COUNTS = re.compile(r"(?:counts?|cnts?|ticks?|inc|in[ck]rement[es]?|pulses?|impulse|steps?)(/s)?(?::(.*))?")
-_SCALED = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)\s*[*·x]?\s+(\S.*)", re.IGNORECASE)
+_SCALED = re.compile(r"x?([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)\s*[*·x]?\s+(\S.*)", re.IGNORECASE)
 _LETTERS = str.maketrans({"°": "deg", "º": "deg", "µ": "u", "μ": "u", "⁻": "-", "¹": "1", "−": "-"})
 
 
 def parse_unit(text: str) -> Unit | None:
     """Read a unit such as ``rpm``, ``[deg/s]``, ``counts:2048``, ``0.0049 A`` or ``-1 A``; None if unknown. Encoder
     counts need their number per turn after a colon. A number before the unit scales it, or turns a sign."""
-    label = text.strip("[](){}<> \t")
+    label = re.sub(r"(?i)(?<=[av])\s+(dc|ac|rms)$", "", text.strip("[](){}<> \t"))
     if scaled := _SCALED.fullmatch(label):
         unit, factor = parse_unit(scaled[2]), float(scaled[1])
         if unit is None or not 1e-50 < abs(factor) < 1e50:
@@ -96,7 +96,8 @@ def _set(words: str) -> frozenset[str]:
 
 
 _WORDS = {
-    "t": "t time timestamp timestamps zeit temps tiempo tempo clock sec seconds millis micros elapsed",
+    "t": "t time timestamp timestamps datetime zeit uhrzeit temps heure tiempo hora tempo clock sec seconds millis "
+         "micros elapsed",
     "v": "v u volt volts voltage spannung tension voltaje uq vq ua va um vm vin uin vmot umot vmotor umotor "
          "ankerspannung motorspannung klemmenspannung",
     "i": "i current curr strom courant corriente iq ia im imot imotor amp amps ampere amperes ankerstrom motorstrom",
@@ -125,6 +126,7 @@ _COMMAND = _set("command cmd commanded input eingang")
 _DUTY = _set("duty pwm dutycycle tastgrad")
 _DERIVATIVE = _set("dot rate dt derivative")
 _BRACKETS = re.compile(r"(.*?)[\s_,:/]*[\[({<]([^\])}>]*)[\])}>]\s*")
+_AMIDST = re.compile(r"^(.*?)\s*([\[(][^\])]*[\])])\s+(\w[^\[(]*)$")  # Current(mA) filtered
 _IN = re.compile(r"(.*\S)(?:\s+in\s+|\s+/\s*|\s*,\s+|[\s_.-]+(?=[a-z]+(?:/s)?:\d)|:\s*(?!\d+$))(\S.*)", re.IGNORECASE)
 _NUMBERED = re.compile(r"(.*\S)\s*:\s*\d+\s*")  # of the logger's channel
 _SEPARATORS = re.compile(r"[\s_.\-:/]+")
@@ -155,6 +157,7 @@ def unit_in(label: str) -> tuple[str, Unit | None, bool]:
     """Split a header into its name, its unit, and whether that is surely a unit (``u_a`` is no current)."""
     if (nth := _NUMBERED.fullmatch(label)) and not _COUNTS.fullmatch(re.split(r"[\s_.-]", nth[1].lower())[-1]):
         label = nth[1]
+    label = _AMIDST.sub(r"\1 \3 \2", label)
     if bracket := _BRACKETS.fullmatch(label):
         unit = parse_unit(bracket[2])
         inside = "" if unit or bracket[2].strip() == "t" else bracket[2]  # u(t)

@@ -12,6 +12,7 @@ from motorid.records import headers
 from motorid.records.headers import Unit
 
 _PERCENT = re.compile(r"%|pct|per_?cent|prozent")
+_DATES = ("date", "datum", "fecha", "x_value")
 _DRIVES = re.compile("input|output|control|command|drive")  # words of a column that may well be the drive voltage
 _WHOLE = 1, 100, 255, 1023, 4095, 65535  # of a duty cycle: its share, per cent, counts of a timer of 8 to 16 bits
 _MEANING = {c: f"the {name}" for c, name in NAMES.items()} | {"v": "the drive voltage"}
@@ -50,7 +51,7 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     notes: list[str] = []
     free = [c for c in labels if c not in {p.column for p in places.values()}]
     _named_by_header(places, free, row, notes, [c for c, column in (columns or {}).items() if column is None])
-    _last_resorts(places, labels, notes)
+    _last_resorts(places, row, values or {}, notes)
     _apply_units(places, labels, units, notes)
     # An angle in counts of unknown size is left out, unless it is all there is.
     for channel in (unscaled := [c for c in ("theta", "omega") if c in places and math.isnan(places[c].unit.factor)]):
@@ -67,7 +68,8 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     notes += [f"'{c}' looks like the reference of a controller: what drives the model is '{places['v'].column}'; "
               f"'{c}' is not used." for c in free if headers.is_reference(c)]
     guesses = [f"'{p.column}' as {_MEANING[c]}" for c, p in places.items() if p.score <= 1]
-    plain = [f"{c} ('{p.column}') in {p.unit.symbol}" for c, p in places.items() if not p.stated]
+    plain = [f"{c} ('{p.column}') in {p.unit.symbol}" for c, p in places.items()
+             if not p.stated and p.column in (values or labels)]
     notes += [f"took {', '.join(guesses)}, a guess from the headers; override with columns."] if guesses else []
     notes += [f"no unit stated, assuming {', '.join(plain)}; override with units."] if plain else []
     return Layout({c: places[c] for c in DIMENSIONS if c in places}, notes)
@@ -122,6 +124,7 @@ def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units
         # Of several measured inputs nobody knows which one acts on the motor.
         spare = channel in MEASURED_INPUTS or (best[0].score <= 1 and channel not in ("t", "v"))
         if channel in places or channel in without or (len(best) > 1 and spare):
+            notes += [f"'{p.column}' is not used, '{places['t'].column}' is." for p in best if channel == "t" in places]
             continue
         if len(best) > 1:
             names = " and ".join(f"'{p.column}'" for p in best)
@@ -141,18 +144,28 @@ def first_of_its_name(label: str, labels: Sequence[str]) -> str:
     return name if label.endswith(")") and label[len(name) + 2:-1].isdigit() and name in labels else label
 
 
-def _last_resorts(places: dict[str, Place], labels: Sequence[str], notes: list[str]) -> None:
+def _last_resorts(places: dict[str, Place], labels: Units, values: Mapping[str, Array], notes: list[str]) -> None:
+    timed = [c for c, unit in labels.items() if c.lower() in _DATES or (unit and unit.dimension == "time")]
+    if "t" not in places and timed:
+        places["t"] = Place(timed[0], labels[timed[0]] or _default("t"), labels[timed[0]] is not None, 1.0)
     if not {"i", "omega", "theta"} & set(places) and "y" in labels:
         places["omega"] = Place("y", _default("omega"), False)
         notes.append("took column 'y' as the speed; if it is not, say which channel it is with columns.")
     duty, supply = [c for c in labels if headers.is_duty(c)], [c for c in labels if headers.is_supply(c)]
     if "v" not in places and len(duty) == len(supply) == 1:
-        unit = headers.unit_in(duty[0])[1]
-        ratio = unit if unit and unit.dimension == "ratio" else Unit("ratio", 1.0, "1", "1")
+        unit, (top, whole) = headers.unit_in(duty[0])[1], _reach(duty[0], values)
+        ratio = unit if unit and unit.dimension == "ratio" else Unit("ratio", 1 / whole, "1", f"1/{whole:.4g}")
         scale = headers.unit_in(supply[0])[1] or _default("v")
         product = Unit("voltage", ratio.factor * scale.factor, "V", f"{ratio.label}·{scale.label}")
         places["v"] = Place(duty[0], product, True, times=supply[0])
-        notes.append(f"took '{duty[0]}' times '{supply[0]}' as the drive voltage.")
+        whole_is = "" if ratio is unit else f" (reaches {top:.4g}, of {whole:.4g})"
+        notes.append(f"took '{duty[0]}'{whole_is} times '{supply[0]}' as the drive voltage.")
+
+
+def _reach(duty: str, values: Mapping[str, Array]) -> tuple[float, float]:
+    """Return how far a duty cycle goes, and which number stands for all of the supply."""
+    top = max((abs(y) for y in values.get(duty, ()) if math.isfinite(y)), default=0.0)
+    return top, 100 if _PERCENT.search(duty.lower()) else next((n for n in _WHOLE if top <= n), top)
 
 
 def _apply_units(places: dict[str, Place], labels: Sequence[str], units: Mapping[str, object],
@@ -167,7 +180,10 @@ def _apply_units(places: dict[str, Place], labels: Sequence[str], units: Mapping
         was, unit = places[channel], headers.require_unit(text, channel)
         if was.stated and not math.isclose(abs(was.unit.factor), abs(unit.factor)):
             notes.append(f"'{was.column}' says {was.unit.label}, and is read as {unit.label}: units asks for it.")
-        places[channel] = replace(was, unit=unit, stated=True)
+        times = was.times if unit.dimension == "ratio" else None  # volts of a duty cycle are said for one supply
+        scale = times and (headers.unit_in(times)[1] or _default("v"))
+        unit = replace(unit, factor=unit.factor * scale.factor, symbol="V") if scale else unit
+        places[channel] = replace(was, unit=unit, stated=True, times=times)
     theta, omega = places.get("theta"), places.get("omega")
     if theta and omega and theta.unit.dimension == "length" and not omega.stated:
         places["omega"] = replace(omega, unit=Unit("linear speed", 1.0, "m/s", "m/s"))
@@ -180,8 +196,7 @@ def _require(places: Mapping[str, Place], labels: Sequence[str], values: Mapping
     if not missing:
         return
     duty = [c for c in labels if headers.is_duty(c)] if "v" in missing else []
-    top = max((abs(y) for c in duty[:1] for y in values.get(c, ()) if math.isfinite(y)), default=0.0)
-    whole = 100 if duty and _PERCENT.search(duty[0].lower()) else next((n for n in _WHOLE if top <= n), top)
+    top, whole = _reach(duty[0], values) if duty else (0.0, 1)
     more = (f" '{duty[0]}' is a duty cycle; with a constant supply of, say, 12 V ('12 V' for 0 to 1, '0.12 V' for per "
             f"cent, '0.047 V' for 0 to 255; it reaches {top:.4g} here): columns={{'v': '{duty[0]}'}}, "
             f"units={{'v': '{12 / whole:.2g} V'}}.") if duty else ""
@@ -191,7 +206,7 @@ def _require(places: Mapping[str, Place], labels: Sequence[str], values: Mapping
     used = {*duty, *(p.column for p in places.values())}
     untimed = " Samples a fixed time apart need no column of time: dt=0.001 says how far, s." * ("t" in missing)
     stated = {c: unit for c in labels for _, unit, sure in [headers.unit_in(c)] if unit and sure}
-    free = [c for c in labels if c not in used and not headers.is_reference(c)
+    free = [c for c in labels if c not in used and not headers.is_reference(c) and c in (values or labels)
             and (c not in stated or stated[c].dimension in DIMENSIONS["v"])]
     free.sort(key=lambda c: not _DRIVES.search(c.lower()))
     asked = [c for c in missing if c != "v" or not more or (free and not duty)]

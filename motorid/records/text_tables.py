@@ -66,7 +66,9 @@ def parse_table(data: bytes) -> TextTable:
     if _JSON.match(text) and (_is_json(text) or all(map(_is_json, body[:2]))):
         raise DataError("it is JSON, not a table. Write it as CSV: a row of names, then one row per sample.")
     dialect, width = sniff(body)
-    first = next((k for k, line in enumerate(body) if is_data(dialect.cells(line), dialect, width)), None)
+    words = not dialect.is_number(dialect.cells(body[len(body) // 2])[0])  # begin a row, not one of a header
+    first = next((k for k, cells in enumerate(map(dialect.cells, body)) if is_data(cells, dialect, width) and (
+        words or dialect.is_number(cells[0]) or cells[0].lower() in MISSING)), None)
     if first is None:
         raise DataError(f"it has no rows of at least two numbers; it begins with '{body[0][:60]}'. Expected "
                         "one row per sample, with a comma, semicolon, tab or space between the values.")

@@ -761,3 +761,11 @@ def test_names_of_records_keep_their_words_where_another_drive_is_spoken_of():
     said = "The voltage and the angle in a run, voltage test, of angle tests, and their voltages."
     assert worded(said, {"v": "A", "theta": "m"}, ["voltage", "run", "voltage test", "angle tests"]) == (
         "The current and the position in a run, voltage test, of angle tests, and their currents.")
+
+
+@pytest.mark.parametrize(("size", "unit"), [(1e3, "ms"), (1e6, "us"), (1e9, "ns")])
+def test_one_advice_on_the_unit_of_the_time_is_enough(steps, size, unit):
+    """Nanoseconds were to be tried as microseconds, and then as milliseconds."""
+    assert f"units={{'t': '{unit}'}}" in said(steps.with_(t=steps.t * size))
+    read = steps.with_(t=steps.t * size * 1e-3, meta={**steps.meta, "original_units": {"t": "ms"}})
+    assert (f"units={{'t': '{unit}'}}" in said(read)) == (unit != "ms")

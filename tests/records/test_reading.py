@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -635,3 +636,91 @@ def test_a_column_that_is_taken_beside_those_that_were_named_is_said(tmp_path):
     assert told in read_csv(path, columns=named).meta["notes"]
     assert told not in read_csv(path, columns={**named, "theta": "frame_angle"}).meta["notes"]
     assert told not in read_csv(path, columns={"v": "current_A"}).meta["notes"], "of the input alone"
+
+
+# -- what loggers, spreadsheets and oscilloscopes write ------------------------------------------------------
+
+
+def _body(stamp, sep=",", n=60, decimal="."):
+    lines = [sep.join([stamp(k), *(f"{x:.4f}".replace(".", decimal) for x in (k % 7, np.sin(k), k % 5))])
+             for k in range(n)]
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize(("header", "stamp"), [
+    ("Zeit", lambda k: f"12:00:00,{k:03d}"),
+    ("Uhrzeit", lambda k: f"23:59:59,{970 + k}" if k < 30 else f"00:00:00,{k - 30:03d}"),
+    ("timestamp", lambda k: f"2024-03-05 12:00:00,{k:03d}"),  # of Python's logging
+    ("Datum", lambda k: f"05.03.2024 12:00:00,{k:03d}"),
+    ("Date", lambda k: f"03/05/2024 11:59:58.{k:03d} AM"),
+    ("Time", lambda k: f"00:58.{k:03d}"),  # a spreadsheet's minutes and seconds
+    ("Time", lambda k: f"12:00:00:{k:03d}"),
+])
+def test_clock_times_and_dates_as_loggers_write_them(tmp_path, header, stamp):
+    """A comma before the milliseconds made them seconds, a thousand times too long."""
+    run = read_csv(write(tmp_path, f"{header};U [V];I [A];n [rpm]\n" + _body(stamp, ";", decimal=",")))
+    assert run.t == pytest.approx(np.arange(60) * 1e-3, abs=1e-9)
+    assert "no unit stated, assuming t" not in notes(run)
+
+
+def test_a_time_that_is_none_says_how_to_do_without(tmp_path):
+    with pytest.raises(DataError, match=r"neither numbers nor dates.*dt=0\.001"):
+        read_csv(write(tmp_path, "t,v,i,omega\n" + _body(lambda k: "soon" * (1 + k % 2))))
+
+
+@pytest.mark.parametrize(("header", "full"), [
+    ("duty_pct", 100), ("pwm_percent", 100), ("pwm", 255), ("duty [‰]", 1000), ("duty", 1)])
+def test_a_duty_cycle_times_the_supply_is_taken_as_far_as_it_goes(tmp_path, header, full):
+    duty = np.resize([0.0, 1.0, -0.5, 0.25], 60)
+    text = "".join(f"{k * 1e-3:.3f},{d * full:.6g},12,{d:.3f}\n" for k, d in enumerate(duty))
+    path = write(tmp_path, f"time_s,{header},supply_V,speed_rad_s\n" + text)
+    assert read_csv(path).inputs["v"] == pytest.approx(12 * duty, rel=1e-6)
+    # Volts of one are said for one supply, and not multiplied by it again; a share still is.
+    assert read_csv(path, units={"v": f"{6 / full} V"}).inputs["v"] == pytest.approx(6 * duty, rel=1e-6)
+    if header == "duty_pct":
+        run = read_csv(path, units={"v": "%"})
+        assert run.inputs["v"] == pytest.approx(12 * duty, rel=1e-6)
+        assert run.units["v"] == "V"
+
+
+def test_a_column_that_numbers_runs_begins_a_new_one_where_it_changes(tmp_path):
+    text = "".join(f"{1 + k // 30},{k * 1e-3:.3f},{k % 7},{np.sin(k):.3f}\n" for k in range(60))
+    runs = read_runs(write(tmp_path, "run,time_s,voltage_V,speed_rad_s\n" + text))
+    assert [r.n for r in runs] == [30, 30]
+    assert "a new run begins 1 time, where 'run' changes" in notes(runs[0])
+    named = re.sub(r"(?m)^1,", "up,", re.sub(r"(?m)^2,", "down,", text))
+    assert len(read_runs(write(tmp_path, "test,time_s,voltage_V,speed_rad_s\n" + named))) == 2
+    mixed = "".join(f"{1 + k % 2},{k // 2 * 1e-3:.3f},{k % 7},{np.sin(k):.3f}\n" for k in range(120))
+    (run,) = read_runs(write(tmp_path, "motor_id,time_s,voltage_V,speed_rad_s\n" + mixed))
+    assert "'motor_id' changes in 119 rows: several at once? Split the file by it." in notes(run)
+
+
+def test_a_time_of_its_own_beside_dt_is_told(tmp_path):
+    text = "".join(f"{k * 1e-3},{k % 7},{k % 5}\n" for k in range(60))
+    path = write(tmp_path, "time_s,voltage_V,speed_rad_s\n" + text)
+    run = read_csv(path, dt=0.01)
+    assert run.dt == pytest.approx(0.01)
+    assert "'time_s' is not used" in notes(run)
+    with pytest.raises(DataError, match="no column looks like the time"):
+        read_csv(path, columns={"t": None})
+
+
+def test_a_header_of_many_rows_of_numbers_is_no_data(tmp_path):
+    """As LabVIEW writes it."""
+    above = ("LabVIEW Measurement\t\nChannels\t3\t\t\t\nSamples\t60\t60\t60\t\nX0\t0,0\t0,0\t0,0\t\n"
+             "Delta_X\t0,001\t0,001\t0,001\t\nX_Value\tVoltage\tCurrent\tSpeed\tComment\n")
+    run = read_csv(write(tmp_path, above + _body(lambda k: f"0,{k:03d}", "\t", decimal=",")))
+    assert run.n == 60
+    assert run.dt == pytest.approx(1e-3)
+    assert run.channels == ("i", "omega")
+
+
+def test_a_unit_amidst_a_header_and_one_of_direct_current(tmp_path):
+    body = _body(lambda k: f"{k * 1e-3:.3f}")
+    run = read_csv(write(tmp_path, "Time(s),Voltage (V DC),Current(mA) filtered,Speed (x100 rpm)\n" + body))
+    assert run.meta["original_units"]["v"] == "V"
+    assert run.outputs["i"] == pytest.approx(np.round(np.sin(np.arange(60)), 4) * 1e-3, abs=1e-9)
+    assert run.outputs["omega"].max() == pytest.approx(4 * 100 * 2 * np.pi / 60)
+    two = "".join(f"{k * 1e-3:.3f},{k % 7},{k % 5},{k % 4}\n" for k in range(60))
+    with pytest.raises(DataError, match="look equally like the current"):
+        read_csv(write(tmp_path, "Time(s),Voltage(V),Current(mA) filtered,Current(mA) raw\n" + two))
