@@ -42,6 +42,7 @@ _OPTIONS = ((r"\b(columns|units)=\{(.*?)\}", lambda m: f"--{m[1]} {_pairs(m[2])}
             (r"\bmodel\.(fix|free)\('?(\w+)'?(=[^)]*)?\)", r"--\1 \2\3"),
             (r"\bmi\.evaluate\(model, runs\)", "motorid simulate FIT.json RUN..."),
             (r"\bmi\.load\(path, effects=\[\w+\]\)", "--effects-from FILE.py"),
+            (r"\bSteadyState\(\) (cannot.*), or leave it out\.", r"The steady state of --formulation hard \1."),
             (r" If you know where it comes from, mi\.load.*", ""))
 MANY = ("--validate",)  # options that take all names up to the next option
 OUTPUTS = ("--json", "--report")  # options that write a file
@@ -289,15 +290,15 @@ def next_command(name: str, *more: str) -> str:
     return line if kept and len(line) <= 2 * WIDTH else f"{short} (the same records and options)"
 
 
-def save_report(result: Any, path: Any, held_out: Sequence[Any] = (), force: bool = False) -> None:
-    """Write the page of a result, if a path was given."""
+def save_report(result: Any, path: Any, held_out: Sequence[Any] = (), force: bool = False, quiet: bool = False) -> None:
+    """Write the page of a result, if a path was given; and say so, unless numbers alone go to the screen."""
     if path is None:
         return
     from motorid.reports.report import report
 
     with progress("Writing the report"):
         written = report(result, path, command=" ".join(["motorid", *sys.argv[1:]]), validate=held_out, force=force)
-    show(f"Report: {written}")
+    show(None if quiet else f"Report: {written}")
 
 
 def _say(text: str, status: int = INTERRUPTED) -> int:

@@ -1,6 +1,7 @@
 """The commands `diagnose`, `design`, which plans what would decide, and `demo`, the story on shipped records."""
 
 import functools
+import re
 from collections.abc import Sequence
 from json import loads
 from pathlib import Path
@@ -89,7 +90,7 @@ def diagnose_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Vali
         _show_diagnosis(found, notes, report, remainder_to)
     if json:
         write_json(found.to_dict() | {"notes": notes}, json, options.force)
-    save_report(found, report, held_out, options.force)
+    save_report(found, report, held_out, options.force, quiet=json == "-")
     if remainder_to:
         assert found.remainder is not None
         name = remainder_to.stem
@@ -97,7 +98,8 @@ def diagnose_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Vali
             law = found.remainder.code(name if name.isidentifier() else "remainder")
         write_files({remainder_to: law}, options.force)
         effects = ",".join((*found.remainder.model.effect_names, name))
-        show(f"Written: {remainder_to}. Fit with it: --effects-from {remainder_to} --effects {effects}")
+        show(None if json == "-" else
+             f"Written: {remainder_to}. Fit with it: --effects-from {remainder_to} --effects {effects}")
     if found.stopped == STOPPED_BY_HAND:
         raise typer.Exit(INTERRUPTED)
 
@@ -131,15 +133,16 @@ def _next_step(found: Diagnosis, report: Path | None = None, remainder_to: Path 
     if found.remainder is not None and found.remainder.proposed and remainder_to is None:
         command = next_command("diagnose", "--remainder-to", "remainder.py")
         return f"Next: {command}\nIt writes what remains as an effect."
+    read = [option.replace(" ", "=") for option in re.findall(r"with (--\S+(?: \d\S*)?) the error", found.text)]
     if found.effects:
         names = ",".join(found.after.model.effect_names)
-        return f"Next: {next_command('fit', '--effects', names, '--json', 'fit.json')}"
+        return f"Next: {next_command('fit', '--effects', names, *read, '--json', 'fit.json')}"
     if found.verdict == "unexplained":
         command = f"look at {report}." if report else next_command("diagnose", "--report", "found.html")
         return f"Next: {command}\nIt shows where the model fails."
     if found.after.mostly_noise:
         return "Next: record again, driven by larger steps or with less noise: these records tell a fit little."
-    return f"Next: {next_command('fit', '--json', 'fit.json')}\nThen: motorid export fit.json motor.casadi"
+    return f"Next: {next_command('fit', *read, '--json', 'fit.json')}\nThen: motorid export fit.json motor.casadi"
 
 
 def design_command(found_json: Found, out: Plan = None, goal: Goal = None, parameters: Parameters = None,

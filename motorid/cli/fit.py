@@ -58,7 +58,7 @@ def fit_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Validate 
         _show_fit(found, records, notes, judged)
     if json:
         write_json(fit_dict(found, judged) | {"notes": notes}, json, options.force)
-    save_report(found, report, held_out, options.force)
+    save_report(found, report, held_out, options.force, quiet=json == "-")
     if found.status == "failed":
         raise typer.Exit(FAILED)
 
@@ -108,7 +108,8 @@ def fit_many_command(directories: Motors, options: opt.FitOptions, out: MotorTab
     with processes(min(jobs, len(motors))) as over:
         found = fit_many(model, motors, map=over, journal=journal, reading=options.reading, **options.keywords())
     _give(found, json, options.force)
-    show(f"Table: {found.save(out, options.force)}" if out else None)
+    told = f"Table: {found.save(out, options.force)}" if out else None
+    show(told if json != "-" else None)
     if found.interrupted:
         raise typer.Exit(INTERRUPTED)
     if len(found.failed) == len(found.rows):
@@ -223,7 +224,7 @@ def identifiability_command(runs: opt.Runs, options: opt.FitOptions, json: opt.J
     fitted = options.fit(options.read(runs))
     found = identifiability(fitted)
     _give(found, json, options.force)
-    save_report([fitted, found], report, force=options.force)
+    save_report([fitted, found], report, force=options.force, quiet=json == "-")
 
 
 @opt.with_options(opt.FitOptions)
@@ -236,7 +237,7 @@ def robustness_command(runs: opt.Runs, options: opt.FitOptions, starts: Starts =
     fitted = options.fit(options.read(runs))
     found = multistart(fitted, starts=starts, spread=spread, seed=seed)
     _give(found, json, options.force)
-    save_report([fitted, found], report, force=options.force)
+    save_report([fitted, found], report, force=options.force, quiet=json == "-")
     if found.interrupted:
         raise typer.Exit(INTERRUPTED)
 

@@ -94,7 +94,7 @@ class Whitening:
         """Return (N, ny, …) per run, filtered over time and stacked as rows; the first samples are left out."""
         parts = (np.stack([_filtered(a, np.nan_to_num(y[:, j])) for j, a in enumerate(self.filters)], axis=1)
                  for y in stacks)
-        return np.concatenate([part.reshape(-1, *part.shape[2:]) for part in parts])
+        return np.concatenate([part.reshape(part.shape[0] * part.shape[1], *part.shape[2:]) for part in parts])
 
     def transposed(self, rows: Array, lengths: Sequence[int]) -> list[Array]:
         """Return the transposed filters on stacked `rows`, (N, ny) for each run of N samples in `lengths`."""

@@ -103,7 +103,9 @@ def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ())
             values[part] = float(p["value"])
             fixed |= {part: values[part]} if p["fixed"] else {}
     except (KeyError, TypeError, ValueError):
-        raise DataError(f"this is not a fitted model, or damaged: '{part}' is missing or wrong; expected model.base, "
+        what = "a diagnosis and no fit (motorid fit RUN... --json fit.json writes one)" if "verdict" in contents else (
+            "not a fitted model, or damaged")
+        raise DataError(f"this is {what}: '{part}' is missing or wrong; expected model.base, "
                         "model.effects and parameters, each with a number as value, and fixed.") from None
     model = _assembled(head, effects)
     missing = set(model.parameters) ^ set(values)

@@ -555,7 +555,7 @@ def test_what_is_mostly_noise_is_recorded_again_whatever_drives_it():
     """A drive that is given a torque was to be recorded with larger steps of the voltage."""
     last = SimpleNamespace(mostly_noise=True, model=mi.torque_driven())
     told = _next_step(SimpleNamespace(stopped="", suggestion=None, remainder=None, effects=(), verdict="adequate",
-                                      after=last))
+                                      after=last, text=""))
     assert told.startswith("Next: record again, driven by larger steps or with less noise")
     assert "voltage" not in told
 
@@ -588,3 +588,48 @@ def test_a_held_out_record_of_another_scale_is_told(tmp_path, command):
         write_csv(run.with_(inputs={"v": run.inputs["v"] / volt}), tmp_path / f"{name}.csv")
     found = motorid_json(tmp_path, *command, tmp_path / "run.csv", "--validate", tmp_path / "check.csv")
     assert any("12 times the speed in check as in run" in note for note in found["notes"])
+
+
+def test_numbers_alone_go_to_the_screen_where_they_were_asked_for(tmp_path):
+    """What was written beside them made no JSON of it."""
+    run, page = FRICTION / "run1.csv", tmp_path / "page.html"
+    assert json.loads(motorid("fit", run, "--json", "-", "--report", page).out)["model"]
+    found = json.loads(motorid("diagnose", run, "--max-effects", 0, "--json", "-", "--report", page, "--force").out)
+    assert found["verdict"]
+    (tmp_path / "motors").mkdir()
+    write_csv(read_runs(run)[0], tmp_path / "motors" / "one.csv")
+    done = motorid("fit-many", tmp_path / "motors", "--out", tmp_path / "table.csv", "--json", "-")
+    assert json.loads(done.out)
+    assert (tmp_path / "table.csv").exists()
+
+
+def test_what_nobody_asked_for_has_the_option_that_does():
+    done = motorid("fit", FRICTION / "run1.csv", "--formulation", "hard", "--current-limit", 30)
+    assert done.status == 1
+    assert "The steady state of --formulation hard cannot be kept" in done.err
+
+
+def test_a_diagnosis_is_told_from_a_fit(tmp_path):
+    motorid_json(tmp_path, "diagnose", FRICTION / "run1.csv", "--max-effects", 0)
+    done = motorid("simulate", tmp_path / "result.json", FRICTION / "run1.csv")
+    assert done.status == 2
+    assert "this is a diagnosis and no fit (motorid fit RUN... --json fit.json writes one)" in done.err
+
+
+@pytest.mark.parametrize("verdict", ["missing", "adequate"])
+def test_the_next_command_reads_the_records_as_the_diagnosis_did(verdict, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["motorid", "diagnose", "run.csv"])
+    text = ("The voltage acts 5 ms earlier than it was logged: with --delay=-0.005 the error falls (speed 50 → 2 %), "
+            "and this diagnosis uses it. 3 samples are left out: with --no-spikes the error falls (speed 2 → 1 %).")
+    last = SimpleNamespace(mostly_noise=False, model=mi.dc_motor() + mi.effects.coulomb)
+    found = SimpleNamespace(stopped="", suggestion=None, remainder=None, verdict=verdict, after=last, text=text,
+                            effects=("coulomb",) if verdict == "missing" else ())
+    assert "--delay=-0.005 --no-spikes --json fit.json" in _next_step(found)
+
+
+def test_a_voltage_of_zero_is_said_and_no_arithmetic(tmp_path):
+    run = read_runs(FRICTION / "run1.csv")[0]
+    path = write_csv(run.with_(inputs={"v": 0 * run.inputs["v"]}), tmp_path / "zero.csv")
+    done = motorid("diagnose", path)
+    assert done.status == 0, done.err
+    assert "the voltage" in done.out
