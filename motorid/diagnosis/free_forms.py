@@ -8,6 +8,7 @@ fading memory (Laguerre and Kautz models: Wahlberg, IEEE Trans. Automatic Contro
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -395,8 +396,7 @@ def values_of(functions: Sequence[str], form: Form, signal: Mapping[str, Array])
     names = {"ca": np, "z": z, "m": SimpleNamespace(sign=lambda z: np.tanh(z / signal["width"][0])),
              "past": lambda z, length: past(z, along, length, first)}
     names |= {kind: lambda z, place, kind=kind: _stepped(kind, z, along, place, first) for kind in STEPS}
-    fixed = (PLACE.sub(r"\1", f) for f in functions)
-    return np.column_stack([np.broadcast_to(np.asarray(eval(f, names), float), z.shape) for f in fixed])
+    return np.column_stack([np.broadcast_to(np.asarray(eval(_compiled(f), names), float), z.shape) for f in functions])
 
 
 def basis_of(form: Form, signal: Mapping[str, Array], span: Span) -> Array:
@@ -417,6 +417,7 @@ def basis_of(form: Form, signal: Mapping[str, Array], span: Span) -> Array:
 BALANCES = ("voltage", "torque")
 STATES = {"torque": "omega", "voltage": "i"}  # whose rate a balance is
 NUDGE = 1e-3  # of a size
+_compiled = lru_cache(4096)(lambda f: compile(PLACE.sub(r"\1", f), "<form>", "eval"))  # every run asks for it
 EXACT = 1e-12  # share of a square that sums of products still tell
 UNBOUNDED = 1e9  # in units of the noise, per unit of what a form puts in
 

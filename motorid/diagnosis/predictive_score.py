@@ -207,13 +207,15 @@ def _log_densities(r: Array, labels: NDArray[np.intp], count: int, floor: float)
 def left_out(residual: Array, columns: Array, labels: NDArray[np.intp]) -> Array:
     """Return what `residual` (n,) would be in each block, left out of the fit of `columns` (n, k)."""
     scale2 = float(residual @ residual) / max(len(residual), 1)
-    found, order = residual.copy(), np.argsort(labels, kind="stable")
-    blocks = [(rows, j := columns[rows], j.T @ j)
-              for rows in np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)]
-    normal = sum(own for *_, own in blocks) + scale2 * np.eye(columns.shape[1])
-    for rows, j, own in blocks:
-        found[rows] += j @ np.linalg.solve(normal - own, j.T @ residual[rows])
-    return found
+    order = np.argsort(labels, kind="stable")
+    edges = np.flatnonzero(np.diff(labels[order])) + 1
+    blocks = np.split(columns[order], edges)
+    products = np.array([[j.T @ r] for j, r in zip(blocks, np.split(residual[order], edges), strict=True)])
+    own = np.array([j.T @ j for j in blocks])
+    normal = own.sum(axis=0) + scale2 * np.eye(columns.shape[1])
+    sizes = np.linalg.solve(normal - own, np.swapaxes(products, 1, 2))[..., 0]
+    moved = np.concatenate([j @ by for j, by in zip(blocks, sizes, strict=True)])
+    return residual + moved[np.argsort(order, kind="stable")]
 
 
 def blocks_of(runs: Sequence[Experiment], evenly: bool = False) -> list[NDArray[np.intp]]:

@@ -31,7 +31,7 @@ from motorid.diagnosis.refit import refit
 from motorid.diagnosis.thresholds import CONTAINED, TRIFLE
 from motorid.display.numbers import listed, number, percent
 from motorid.effects import PER_RUN
-from motorid.errors import ModelError, OutOfTime, UsageError
+from motorid.errors import ModelError, OutOfTime, UsageError, looked_at
 from motorid.estimation.fit import over_moments, solve
 from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
@@ -421,7 +421,7 @@ class Remainder:
         if self.kind != "structure":
             raise UsageError(f"the remainder is {self.kind}: nothing is left that a curve over a quantity predicts.")
         best = None
-        with contextlib.suppress(OutOfTime), budget(SECONDS):
+        with contextlib.suppress(OutOfTime), budget(SECONDS), looked_at():
             with contextlib.suppress(OutOfTime), budget(SECONDS / 2):  # they may be many times as long
                 best = (whole := self._on_whole) and whole._grown
             best = best or self._grown
