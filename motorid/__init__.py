@@ -24,10 +24,9 @@ from motorid import effects
 from motorid.acquire.recorder import record
 from motorid.acquire.virtual import virtual_bench
 from motorid.diagnosis.bench_loop import identify_on
-from motorid.diagnosis.diagnose import diagnose
+from motorid.diagnosis.diagnose import diagnose, improve
 from motorid.diagnosis.experiment_design import design_experiment, suggest_experiment
 from motorid.diagnosis.locate import locate
-from motorid.diagnosis.stepwise import improve
 from motorid.estimation.fit import fit, solve
 from motorid.estimation.result import Failure, Fit, compare
 from motorid.estimation.shooting.formulations import compare_formulations

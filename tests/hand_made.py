@@ -125,8 +125,6 @@ def adequacy(adequate):
             "rms": 0.0043,
             "ratio": 1.02,
             "autocorrelation": 0.01,
-            "input_correlation": 0.02,
-            "effective_samples": 3800.0,
             "p_value": 0.4,
         }
     }

@@ -28,7 +28,7 @@ from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import FINER, LARGER, SEARCHED
 from motorid.display.numbers import factor, listed, percent
 from motorid.estimation.result import Fit
-from motorid.numerics.autoregression import autocorrelation, effective_samples
+from motorid.numerics.autoregression import autocorrelation
 from motorid.numerics.signals import Array, despiked, quantum, winsorised
 from motorid.problem.simulate import largest
 from motorid.records.experiment import Experiment
@@ -110,30 +110,17 @@ def _channel(fit: Fit, channel: str) -> dict[str, float]:
     noise = float(np.sqrt(np.mean([fit.problem.runs[k].sigma[channel] ** 2 for k, _ in parts])))
     r = np.concatenate([p for _, p in parts])
     r = r[np.isfinite(r)]
-    runs = fit.problem.experiments
-    linked = max((_largest_cross_correlation(runs[k].inputs["v"], p) for k, p in parts), default=0.0)
     alone = np.concatenate([despiked(p) for _, p in parts])
     ratio = float(np.sqrt(np.mean(alone**2))) / noise if alone.size else 0.0
     return {"noise": noise, "rms": float(np.sqrt(np.mean(r**2))) if r.size else 0.0, "ratio": ratio,
-            "rounded": float(ratio < AT_ROUNDING and noise < AT_ROUNDING * _rounding(runs, channel)),
-            "autocorrelation": float(np.mean([autocorrelation(p, 1)[-1] for _, p in parts])),
-            "input_correlation": linked, "effective_samples": sum(effective_samples(p) for _, p in parts)}
+            "rounded": float(ratio < AT_ROUNDING and noise < AT_ROUNDING * _rounding(fit.problem.experiments, channel)),
+            "autocorrelation": float(np.mean([autocorrelation(p, 1)[-1] for _, p in parts]))}
 
 
 @lru_cache(maxsize=8)
 def _rounding(runs: tuple[Experiment, ...], channel: str) -> float:
     steps = [quantum(run.outputs[channel]) for run in runs if channel in run.outputs]
     return float(np.sqrt(np.mean(np.square(steps)) / 12))
-
-
-def _largest_cross_correlation(u: Array, r: Array) -> float:
-    """Largest correlation of the residual with the input at any lag up to a quarter of the run."""
-    a, b = u - u.mean(), np.where(np.isfinite(r), r, 0.0)
-    size = np.linalg.norm(a) * np.linalg.norm(b)
-    if size <= 0:
-        return 0.0
-    lags = scipy.signal.correlate(b, a, method="fft")[len(u) - 1 :]
-    return float(np.abs(lags[: len(u) // 4 + 1]).max() / size)
 
 
 def _dependences(fit: Fit, channel: str) -> list[dict[str, Any]]:

@@ -20,7 +20,7 @@ from motorid.diagnosis.model_comparison import far
 from motorid.diagnosis.record_versions import parts_remark
 from motorid.diagnosis.refit import with_lags_exchanged
 from motorid.diagnosis.remainder import Remainder
-from motorid.diagnosis.results import Diagnosis
+from motorid.diagnosis.results import Diagnosis, Ladder
 from motorid.diagnosis.stepwise import Climb, explored, ladder_of
 from motorid.display.numbers import listed, number
 from motorid.effects import LIBRARY
@@ -82,6 +82,34 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
         misread = _contradicting(found.path[-1].fit, found.remaining.adequate, fit.problem.experiments)
         records = () if driven else fit.problem.experiments  # as they were read
         return _told(found, misread, " ".join(w for w in (twice, driven) if w), validate is not None, records)
+
+
+@parallel.one_thread
+def improve(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None, *,
+            effects: Iterable[Effect | str] | None = None, also: Iterable[Effect] = (), max_effects: int = 3,
+            map: Callable[..., Iterable[Any]] = builtins.map, progress: Callable[[str], None] | None = None) -> Ladder:
+    """Add effects one by one, as long as the error on held-out data falls.
+
+    Parameters
+    ----------
+    fit : Fit
+        Of the model to begin with.
+    validate, effects, also, max_effects, map, progress
+        As in `diagnose`.
+
+    Returns
+    -------
+    Ladder
+        The models with training and held-out error; ``ladder.best`` is the last fit, to go on from.
+
+    Examples
+    --------
+    >>> ladder = mi.improve(fit, validate=check, effects=["coulomb", "quadratic_drag"])
+    >>> ladder.best.model.effect_names
+    ('coulomb',)
+    """
+    return diagnose(checked(fit, "improve"), validate, effects=effects, also=also, max_effects=max_effects, map=map,
+                    progress=progress).ladder
 
 
 def _contradicting(last: Fit, adequate: bool, runs: Sequence[Experiment]) -> str:

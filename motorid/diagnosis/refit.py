@@ -16,7 +16,8 @@ from motorid.errors import OutOfTime, otherwise
 from motorid.estimation.continuation import by_continuation, past_ripples, sharpened
 from motorid.estimation.first_guess import first_guess
 from motorid.estimation.fit import LOST, lost
-from motorid.estimation.least_squares import FAILURES, Estimate, cost_at
+from motorid.estimation.least_squares import FAILURES, Estimate
+from motorid.estimation.linearisation import Tangent
 from motorid.estimation.restarts import collapsed_again, restored
 from motorid.estimation.result import Fit
 from motorid.estimation.start_values import ABOVE, exchanged_poles, sizes_like
@@ -331,11 +332,9 @@ def _refit_all(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]],
     leader, alone = _leader(tasks), False
     if leader is not None and (race := _race_tournament((tasks[leader], alone))) is not None:
         races[leader], found[leader] = race, _finish((tasks[leader], race))
-        if (best := _quiet(found[leader])) is not None:
-            alone = True
+        if alone := _quiet(found[leader]) is not None:
             why, least = GivenUp(FAR_BEHIND.format(tasks[leader].effect.name)), FAR_LESS * (tasks[leader].promise or 0)
             found.update({k: why for k, t in enumerate(tasks) if t.promise is not None and t.promise < least})
-            found.update(_needless(tasks, leader, best, map_))
     entered = [k for k in range(len(tasks)) if k not in races and k not in found]
     done = map_(_race_tournament, [(tasks[k], alone) for k in entered])
     races |= {k: race for k, race in zip(entered, done, strict=True) if race is not None}
@@ -369,39 +368,15 @@ def _outdone(tasks: Sequence[Task], races: Mapping[int, Raced], found: Mapping[i
 
 
 def _leader(tasks: Sequence[Task]) -> int | None:
-    """Return which task promises most, the smallest of those that promise nearly as much; None if none does. Where the
-    model is lost, and slopes say little, the one that costs least at its own first guess, if that is less."""
-    costs = {k: _guessed_cost(task) for k, task in enumerate(tasks) if lost(task.fit)}
-    if costs and costs[least := min(costs, key=lambda k: costs[k])] < tasks[least].fit.cost:
-        return least
+    """Return which task promises most, the smallest of those that promise nearly as much; None if none does."""
     promises = {k: task.promise for k, task in enumerate(tasks) if task.promise is not None}
     near = [k for k, promise in promises.items() if promise > NEARLY * max(promises.values())]
     return min(near, key=lambda k: (size_of(tasks[k].model, tasks[k].fit.problem), -promises[k]), default=None)
 
 
-def _guessed_cost(task: Task) -> float:
-    """Return the cost of a task at the first guess of its own."""
-    with contextlib.suppress(*FAILURES):
-        guess = first_guess(task.model, task.fit.problem.experiments, loaded=True)
-        return cost_at(_started(task.fit, _bounded(task.fit, task.model), guess, angular=False).within_worth())
-    return np.inf
-
-
 def _quiet(fit: Fit | GivenUp | None) -> Fit | None:
     """Return a fit that leaves hardly more than noise, or None."""
     return fit if isinstance(fit, Fit) and not far(fit) else None
-
-
-def _needless(tasks: Sequence[Task], leader: int, best: Fit, map_: Callable[..., Iterable[Any]]) -> dict[int, GivenUp]:
-    """Return the tasks that contain an effect that leaves only noise, and from there promise too little."""
-    winner = tasks[leader]
-    wider = {k: widened(best, task.effect, HARDLY) for k, task in enumerate(tasks)
-             if winner.effect.name in task.effect.includes}
-    gains = dict(zip(wider, map_(_gain, wider.values()), strict=True))
-    why = f"no better than {winner.effect.name}, its simpler special case"
-    # The search over starts has its price.
-    prices = {k: task.price - winner.price + float(np.log(len(task.starts))) for k, task in wider.items()}
-    return {k: GivenUp(why) for k, price in prices.items() if gains[k] < price}
 
 
 def _beaten(tasks: Sequence[Task], costs: Mapping[int, float], first: int) -> dict[int, GivenUp]:
@@ -426,17 +401,6 @@ def _finish(begun: tuple[Task, Raced]) -> Fit | None:
     return finished(begun[0].fit, begun[1], POLISH)
 
 
-def _gain(task: Task) -> float:
-    """Return by how much one undamped step from any start promises to lower the cost, not less than nothing."""
-    fit, lowest, like = task.fit, task.fit.cost, None
-    for start in task.starts:
-        with contextlib.suppress(*FAILURES):
-            problem = _started(fit, _bounded(fit, task.model), start, angular=False)
-            like = problem = problem.refined(problem.start) if like is None else replace(problem, _runs=like.runs)
-            lowest = min(lowest, _undamped(*problem.residual_and_jacobian(problem.start)))
-    return fit.cost - lowest
-
-
 def widened(fit: Fit, effect: Effect, above: float = ABOVE) -> Task:
     """Return the refit with `effect` in the place of those that it includes, from where they were: sizes that are at
     least another start at `above` times that; a shape is that of the same unit, if there was one."""
@@ -452,19 +416,14 @@ def widened(fit: Fit, effect: Effect, above: float = ABOVE) -> Task:
 
 
 def hidden_in(fit: Fit, effect: Effect) -> tuple[str, ...]:
-    """Return the parameters whose other values make up for `effect` in the place of those that it contains; empty if
-    its sizes are determined, or nothing else does the same."""
+    """Return the parameters whose other values make up for `effect` in the place of those that it contains: for one of
+    its sizes alone, where the fit has both equal; empty if nothing else does the same."""
     task = widened(fit, effect, 1.0)
     problem = _started(fit, task.model, task.starts[0], angular=False)
     jac = problem.residual_and_jacobian(problem.start)[1] / problem.scaling.slope(problem.start)
-    mine = np.array([p.name in task.starts[0] for p in problem.unknown])
-    norms = np.linalg.norm(jac[:, ~mine], axis=0)
-    others, columns = jac[:, ~mine] / np.where(norms > 0, norms, 1.0), jac[:, mine]
-    left = columns - others @ np.linalg.lstsq(others, columns, rcond=1e-9)[0]
-    _, weakest, turned = np.linalg.svd(left, full_matrices=False)
-    answer = columns @ turned[-1]
-    if weakest[-1] * max(task.starts[0].values()) > 1 or not weakest[-1] < ALONE * np.linalg.norm(answer):
+    name, column = next((p.name, jac[: problem.n_outputs, [k]]) for k, p in enumerate(problem.unknown)
+                        if p.name in task.starts[0])
+    if np.linalg.norm((tangent := Tangent.of(fit)).off(column)) * task.starts[0][name] > 1:
         return ()
-    parts = np.abs(np.linalg.lstsq(others, answer, rcond=1e-9)[0])
-    names = [p.name for p, own in zip(problem.unknown, mine, strict=True) if not own]
-    return tuple(n for n, part in zip(names, parts, strict=True) if part > ALONE * parts.max() and n in fit.values)
+    own = {p.name for e in fit.model.effects if e.name in effect.includes for p in e.parameters}
+    return tuple(n for n in tangent.same_as(column, ALONE) if n not in own)

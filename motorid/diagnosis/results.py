@@ -29,7 +29,7 @@ class Adequacy(Shown):
         Rate of false alarms of the verdict.
     channels : dict of str to dict
         Per channel: ``noise`` and ``rms`` of the residual (SI), ``ratio`` of the two, ``autocorrelation`` at lag 1,
-        ``input_correlation`` (largest), ``effective_samples``, ``p_value``.
+        ``p_value``.
     """
 
     adequate: bool

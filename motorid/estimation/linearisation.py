@@ -202,10 +202,10 @@ class Tangent:
         left = self.residual + c @ coefficients
         return Explained(max(inside - rest**2, 0.0) / max(self.chi2, 1e-300), coefficients / scale, left)
 
-    def same_as(self, columns: Array) -> tuple[str, ...]:
-        """Return the parameters that together make up all of `columns` (n, k); none if something is left of them."""
+    def same_as(self, columns: Array, but_for: float = INSEPARABLE) -> tuple[str, ...]:
+        """Return the parameters that together make up `columns` (n, k) but for a share; none if more is left."""
         size = np.linalg.norm(columns, axis=0)
-        if np.any(np.linalg.norm(self.off(columns), axis=0) > INSEPARABLE * size) or not size.all():
+        if np.any(np.linalg.norm(self.off(columns), axis=0) > but_for * size) or not size.all():
             return ()
         names = [p.name for p in self.fit.problem.unknown]
         jac = self.fit.jacobian[: len(columns)]

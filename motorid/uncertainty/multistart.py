@@ -193,14 +193,6 @@ class Multistart(Printed):
             rows.append(row)
         return pd.DataFrame(rows)
 
-    @cached_property
-    def basins(self) -> Any:
-        """One row per place where fits ended (`pandas.DataFrame`), best first: fits, cost ratio, values."""
-        import pandas as pd
-
-        return pd.DataFrame([{"fits": len(p), "cost_ratio": p[0].cost / self._lowest.cost, **dict(p[0].nrmse),
-                              **{n: p[0].values[n] for n in p[0].start}} for p in self._places("good", "poor")])
-
     @property
     def _lowest(self) -> StartResult | Fit:
         return self.best or self.reference
