@@ -6,10 +6,9 @@ After each addition the earlier effects are tried without, and with others in th
 
 from __future__ import annotations
 
-import builtins
 import contextlib
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -19,8 +18,8 @@ import numpy as np
 from motorid.channels import worded
 from motorid.diagnosis import record_versions as versions
 from motorid.diagnosis.adequacy import following, judge_adequacy, within_noise
-from motorid.diagnosis.admissibility import run_through
-from motorid.diagnosis.candidates import Search, Stages, library
+from motorid.diagnosis.admissibility import run_through, undetermined
+from motorid.diagnosis.candidates import Search, Stages
 from motorid.diagnosis.misspecification import IN_ITS_PLACE, FormGain, Grade, better_forms, differs, grades_of, outdoes
 from motorid.diagnosis.model_comparison import Node, at_noise, beats, choose, evidence, far, group_of, node_of
 from motorid.diagnosis.predictive_score import QUICK, HeldOut, is_sure
@@ -29,10 +28,10 @@ from motorid.diagnosis.remainder import alone_predicting_more, beside_leaving_no
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
 from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, MATERIAL, PLAIN, TRIFLE
 from motorid.diagnosis.verdict import first_answer
-from motorid.errors import OutOfTime, at_least, otherwise
+from motorid.errors import OutOfTime, otherwise
 from motorid.estimation.fit import TOO_FAR, UNFOLLOWED, follows, growth, in_windows, solve
 from motorid.estimation.least_squares import FAILURES
-from motorid.estimation.result import Fit, checked
+from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
 from motorid.numerics import parallel
 from motorid.problem.simulate import largest
@@ -156,7 +155,7 @@ def _finished(found: Climb) -> Climb:
     alike = frozenset[str]().union(*groups)
     rounds = tuple(tuple(_as_it_ended(c, best.key, met, alike) for c in r) for r in found.rounds)
     structure = not found.remaining.adequate
-    forms = better_forms(best.fit, best.fit) if structure else []
+    forms = better_forms(best.fit, best.fit) if structure and (best is not search.root or not found.stopped) else []
     if structure and not forms and at_noise(best) and not found.stopped:
         found, structure = replace(found, remaining=within_noise(found.remaining)), False
     grades = grades_of(best, search.root, groups, forms, structure,
@@ -199,10 +198,12 @@ def _beside_curves(found: Climb) -> Climb:
     return replace(found, grades=tuple(grades))
 
 
-def _without_stops_run_through(found: Climb) -> Climb:
-    """Return a climb in which stops that the motor runs through are named no more."""
+def _sure_to_the_end(found: Climb) -> Climb:
+    """Return a climb in which stops that the motor runs through are named no more; nor, where more than noise is left,
+    a law that the records do not show whole: a free parameter makes it fit what has another shape."""
     fit = found.path[-1].fit
-    told = {e.name: run_through(fit, e) for e in fit.model.effects}
+    more = not found.remaining.adequate or bool(far(fit))
+    told = {e.name: run_through(fit, e) or (undetermined(fit, e) if more else "") for e in fit.model.effects}
     return replace(found, grades=tuple(g if g.grade == "approximates" or not told[g.effect] else Grade(
         g.effect, "approximates", told[g.effect]) for g in found.grades))
 
@@ -305,7 +306,7 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
         parallel.interruption.heard()
         why = OUT_OF_TIME if isinstance(error, OutOfTime) else INTERRUPTED
         found = replace(found, stopped=why, text=f"stopped early: {why}; not all was looked at")
-    return _without_stops_run_through(found), " ".join(records.remarks)
+    return _sure_to_the_end(found), " ".join(records.remarks)
 
 
 def _looks(fit: Fit, held_out: Sequence[Experiment] | None, climbed: Callable[..., Climb],
@@ -370,6 +371,8 @@ def _read_and_climbed(fit: Fit, held_out: Sequence[Experiment] | None,
     """Return the records as they are, but for spikes, as they are better read, and a climb on those."""
     records = Records(fit, held_out and versions.thinned_alike(fit, held_out))
     as_it_was = records.read(spikes) if (spikes := versions.without_spikes(records.fit)) else records
+    if not any(e < (1 - MATERIAL) * records.fit.nrmse[c] for c, e in as_it_was.fit.nrmse.items()):
+        as_it_was = records  # what is left out must be worth it
     records = as_it_was.read(reading) if (reading := versions.better_reading(as_it_was.fit)) else as_it_was
     found = climbed(records, early=True)
     if found.misread is not None:
@@ -501,36 +504,3 @@ def ladder_of(found: Climb, validated: bool) -> Ladder:
         rungs.append(rung)
         before = node
     return Ladder(tuple(rungs), found.text)
-
-
-@parallel.one_thread
-def improve(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None, *,
-            effects: Iterable[Effect | str] | None = None, also: Iterable[Effect] = (), max_effects: int = 3,
-            map: Callable[..., Iterable[Any]] = builtins.map, progress: Callable[[str], None] | None = None) -> Ladder:
-    """Add effects one by one, as long as the error on held-out data falls.
-
-    Parameters
-    ----------
-    fit : Fit
-        Of the model to begin with.
-    validate, effects, also, max_effects, map
-        As in `diagnose`.
-    progress : callable, optional
-        Called with a word on what was done.
-
-    Returns
-    -------
-    Ladder
-        The models with training and held-out error; ``ladder.best`` is the last fit, to go on from.
-
-    Examples
-    --------
-    >>> ladder = mi.improve(fit, validate=check, effects=["coulomb", "quadratic_drag"])
-    >>> ladder.best.model.effect_names
-    ('coulomb',)
-    """
-    at_least(0, max_effects=max_effects)
-    with parallel.progress("Looking for what is missing", max_effects + 1, at_most=True) as show:
-        stages = Stages(max_effects, progress, show, map)
-        found, _ = explored(checked(fit, "improve"), validate, library(effects, also), stages, max_effects)
-    return ladder_of(found, validate is not None)

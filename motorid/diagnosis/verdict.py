@@ -31,10 +31,14 @@ DECIDED = "blocks left out of the fitted runs decided"
 
 def first_answer(fit: Fit, judged: Adequacy, scores: Sequence[Score]) -> str:
     """Return what a look without any refit says: whether the model fits, and what to try first."""
-    likely = [f"{s.effect.name} ({percent(s.drop, 2)})" for s in scores[:3] if s.drop > 0]
-    next_ = (f" Most promising, by the share of the squared error that they would remove: {', '.join(likely)}."
-             if likely and not judged.adequate else "")
-    return f"first answer: {fit.verdict}{next_}"
+    likely = "" if judged.adequate else _promising({s.effect.name: s.drop for s in scores})
+    return f"first answer: {fit.verdict}{likely}"
+
+
+def _promising(drops: Mapping[str, float]) -> str:
+    """Say which effects to try first; empty for none."""
+    likely = ", ".join(f"{name} ({percent(drop, 2)})" for name, drop in list(drops.items())[:3] if drop > 0)
+    return f" Most promising, by the share of the squared error that they would remove: {likely}." if likely else ""
 
 
 def adequate_text(judged: Adequacy, ranking: Sequence[Candidate], last: Fit) -> tuple[str, str]:
@@ -60,7 +64,9 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
     lead = f"Unexplained: {like}, which {none} describes." if like else (
         "Something is missing, and these records do not show what." if grades and remaining.adequate else
         f"Unexplained: something is missing, and {none} explains it.")
-    lead = lead if done else f"Unexplained so far: {like or 'something is missing'}; not all effects were tried."
+    if not done:
+        lead = f"Unexplained so far: {like or 'something is missing'}; not all effects were tried."
+        lead += "" if grades else _promising({c.effect: c.predicted_drop for c in ranking})
     if grades:
         curve = f"{like}, which the library lacks, predicts better in its place"  # the same in few words
         near, share, nearest = _nearest(rungs, grades, ranking)

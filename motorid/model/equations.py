@@ -143,6 +143,9 @@ class Equations:
         """Set what the sensor of `channel` shows; build it on `measured` so that effects can follow."""
         self.measured(channel)
         self.sensors[channel] = ca.SX(expression)
+        if channel == "theta" and "theta_in" in self.inputs:  # what was measured must not predict itself
+            own = self.angle_state() - self.zero
+            self.sensors[channel] = ca.substitute(self.sensors[channel], self.inputs["theta_in"], own)
 
     def _known(self, name: str) -> None:
         if name not in self.placeholders:

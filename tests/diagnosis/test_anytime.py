@@ -295,3 +295,14 @@ def test_a_diagnosis_interrupted_among_its_pairs_ends_there(plain, monkeypatch):
     assert found.stopped == refit.INTERRUPTED
     assert len(asked) == 2
     assert len(found.after.model.effects) in (0, 2)
+
+
+def test_a_search_that_was_stopped_at_once_says_what_to_try_first(monkeypatch):
+    """Not a curve over an angle that was not even measured, for which it took longer than the search itself."""
+    fit, asked = mi.fit(mi.dc_motor(), mi.read_runs(data_path("hidden_friction/run1.csv"))), []
+    monkeypatch.setattr(stepwise, "better_forms", lambda *fits: asked.append(fits) or [])
+    found = mi.diagnose(fit, effects=("coulomb", "brush_drop"), budget=0)
+    assert found.stopped
+    assert found.answer.startswith("Unexplained so far: something is missing; not all effects were tried.")
+    assert "Most promising, by the share of the squared error that they would remove: coulomb (" in found.answer
+    assert not asked

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from command import motorid_json
 import motorid as mi
 from motorid.channels import channel_name
 from motorid.diagnosis import record_versions as readings
+from motorid.diagnosis import stepwise
 from motorid.diagnosis.record_versions import better_reading
 from motorid.display.numbers import number
 from motorid.records.checks import contradictions, dead_times
@@ -290,3 +292,17 @@ def test_a_bridge_whose_pauses_return_the_current_is_named_beside_dry_friction()
     assert found.after.values["a_p"] == pytest.approx(1.5, rel=0.2)  # 1 ms over L/R
     before, after = (found.ladder.rungs[k].validation_nrmse["omega"] for k in (0, -1))
     assert after < 0.04 < before / 5
+
+
+def test_samples_are_left_out_only_where_that_helps(lab, monkeypatch):
+    """Of a current that a driver cuts off some stand far from their neighbours, too, and the error rose without."""
+    rng = np.random.default_rng(10)
+    fit = mi.fit(mi.dc_motor(), recorded(lab, {"coulomb": {"tau_c": 0.008}}, stairs(900, rng), 1e-3, rng, name="run"))
+    for share, said in ((1.0, False), (0.5, True)):
+        left_out = readings.Reading("4 samples are left out", "--no-spikes", lambda run: run)
+        after = SimpleNamespace(nrmse={c: share * e for c, e in fit.nrmse.items()})
+        monkeypatch.setattr(readings, "without_spikes", lambda fit, reading=left_out: reading)
+        monkeypatch.setattr(readings, "better_reading", lambda fit, **how: None)
+        monkeypatch.setattr(readings.Reading, "fitted", lambda reading, fit, after=after: after)
+        records = stepwise._read_and_climbed(fit, None, lambda records, **how: SimpleNamespace(misread=None))[0]
+        assert ("--no-spikes" in " ".join(records.remarks)) == said
