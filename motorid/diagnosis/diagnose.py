@@ -79,7 +79,7 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
         found, driven = explored(checked(fit, "diagnose"), validate, tried, stages, max_effects, budget)
         stages.done("located what is missing")
         twice = repeated(fit.problem.experiments, [validate] if isinstance(validate, Experiment) else validate or ())
-        misread = _contradicting(found.path[-1].fit, found.remaining.adequate, fit.problem.experiments)
+        misread = _contradicting(found, fit.problem.experiments)
         records = () if driven else fit.problem.experiments  # as they were read
         return _told(found, misread, " ".join(w for w in (twice, driven) if w), validate is not None, records)
 
@@ -112,11 +112,11 @@ def improve(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None,
                     progress=progress).ladder
 
 
-def _contradicting(last: Fit, adequate: bool, runs: Sequence[Experiment]) -> str:
+def _contradicting(found: Climb, runs: Sequence[Experiment]) -> str:
     """Say how channels contradict one another; where a model leaves noise (a hoist's current has one sign) nothing."""
-    if adequate or not far(last):
+    if found.remaining.adequate or not far(last := found.path[-1].fit):
         return ""
-    bare = "supply_side_current" in last.model.effect_names  # that of a supply is never negative
+    bare = any(g.effect == "supply_side_current" and g.grade != "approximates" for g in found.grades)  # never negative
     plain = [r.without("i") if bare and len(r.outputs) > 1 and "i" in r.outputs else r for r in runs]
     said = contradictions(plain if "i" in SHOWN[last.model.base] else [as_command(r) for r in plain])
     return f"The records seem to contradict themselves; check first: {said} Taken as they are: " if said else ""

@@ -487,3 +487,11 @@ def test_a_current_that_is_never_negative_may_be_the_supply_s():
     found = diagnosed(runs, ("supply_side_current", "coulomb", "brush_drop", "current_gain"))
     assert found.effects == ("supply_side_current",)
     assert "contradict" not in found.text
+
+
+def test_a_current_without_its_sign_is_said_first_where_no_supply_explains_it():
+    """A supply's current, which is never negative either, helped, and hid it."""
+    run = mi.read_runs(mi.data_path("hidden_friction/run1.csv"))[0]
+    run = run.with_(outputs={**run.outputs, "i": np.abs(run.outputs["i"])})
+    found = mi.diagnose(mi.fit(mi.dc_motor(), run), effects=("coulomb", "supply_side_current"))
+    assert found.answer.startswith("The records seem to contradict themselves; check first: the current is never neg")
