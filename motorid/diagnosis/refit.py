@@ -416,14 +416,13 @@ def widened(fit: Fit, effect: Effect, above: float = ABOVE) -> Task:
 
 
 def hidden_in(fit: Fit, effect: Effect) -> tuple[str, ...]:
-    """Return the parameters whose other values make up for `effect` in the place of those that it contains: for one of
-    its sizes alone, where the fit has both equal; empty if nothing else does the same."""
-    task = widened(fit, effect, 1.0)
+    """Return the parameters whose other values make up for `effect` in the place of those that it contains: for each of
+    its sizes alone, where the fit has all equal; empty if nothing else does the same, or not all of them show."""
+    task, tangent = widened(fit, effect, 1.0), Tangent.of(fit)
     problem = _started(fit, task.model, task.starts[0], angular=False)
     jac = problem.residual_and_jacobian(problem.start)[1] / problem.scaling.slope(problem.start)
-    name, column = next((p.name, jac[: problem.n_outputs, [k]]) for k, p in enumerate(problem.unknown)
-                        if p.name in task.starts[0])
-    if np.linalg.norm((tangent := Tangent.of(fit)).off(column)) * task.starts[0][name] > 1:
+    columns = jac[: problem.n_outputs, [p.name in task.starts[0] for p in problem.unknown]]
+    if np.linalg.norm(tangent.off(columns), axis=0).max() * max(task.starts[0].values()) > 1:
         return ()
     own = {p.name for e in fit.model.effects if e.name in effect.includes for p in e.parameters}
-    return tuple(n for n in tangent.same_as(column, ALONE) if n not in own)
+    return tuple(n for n in tangent.same_as(columns, ALONE) if n not in own)

@@ -371,8 +371,8 @@ def _read_and_climbed(fit: Fit, held_out: Sequence[Experiment] | None,
     """Return the records as they are, but for spikes, as they are better read, and a climb on those."""
     records = Records(fit, held_out and versions.thinned_alike(fit, held_out))
     as_it_was = records.read(spikes) if (spikes := versions.without_spikes(records.fit)) else records
-    if not any(e < (1 - MATERIAL) * records.fit.nrmse[c] for c, e in as_it_was.fit.nrmse.items()):
-        as_it_was = records  # what is left out must be worth it
+    if sum(e / max(records.fit.nrmse[c], 1e-300) - 1 for c, e in as_it_was.fit.nrmse.items()) > 0:
+        as_it_was = records  # what was left out did not belie the model
     records = as_it_was.read(reading) if (reading := versions.better_reading(as_it_was.fit)) else as_it_was
     found = climbed(records, early=True)
     if found.misread is not None:

@@ -494,4 +494,5 @@ def test_a_current_without_its_sign_is_said_first_where_no_supply_explains_it():
     run = mi.read_runs(mi.data_path("hidden_friction/run1.csv"))[0]
     run = run.with_(outputs={**run.outputs, "i": np.abs(run.outputs["i"])})
     found = mi.diagnose(mi.fit(mi.dc_motor(), run), effects=("coulomb", "supply_side_current"))
-    assert found.answer.startswith("The records seem to contradict themselves; check first: the current is never neg")
+    said = "The records seem to contradict themselves; check first: run1: the current is never negative"
+    assert found.answer.startswith(said)
