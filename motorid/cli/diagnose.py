@@ -133,7 +133,7 @@ def _next_step(found: Diagnosis, report: Path | None = None, remainder_to: Path 
     if found.remainder is not None and found.remainder.proposed and remainder_to is None:
         command = next_command("diagnose", "--remainder-to", "remainder.py")
         return f"Next: {command}\nIt writes what remains as an effect."
-    read = [option.replace(" ", "=") for option in re.findall(r"with (--\S+(?: \d\S*)?) the error", found.text)]
+    read = [option.replace(" ", "=") for option in re.findall(r"with (--\S+(?: \S+)?) the error", found.text)]
     if found.effects:
         names = ",".join(found.after.model.effect_names)
         return f"Next: {next_command('fit', '--effects', names, *read, '--json', 'fit.json')}"

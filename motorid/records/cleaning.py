@@ -17,7 +17,7 @@ from motorid.records.preprocessing import unwrapped
 
 Texts = Mapping[str, Sequence[object]]
 
-_RUNS = ("run", "run_id", "trial", "test", "experiment", "motor", "motor_id", "messung", "versuch", "essai")
+_RUNS = ("run", "run_id", "trial", "test", "experiment", "motor_id", "messung", "versuch", "essai")
 _LATE = 2  # this many rows in a row may come late before it counts as a new start of time
 
 
@@ -40,6 +40,7 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     outputs = {c: a for c, a in values.items() if c not in (*INPUTS, *empty)}
     said += [f"'{places[c].column}' ({c}) is missing in {np.count_nonzero(np.isnan(a))} of {len(a)} rows."
              for c, a in outputs.items() if np.isnan(a).any()]
+    used = {p.column for p in layout.places.values()}
     if not outputs:
         raise DataError(f"every sample of {', '.join(repr(places[c].column) for c in values if c not in INPUTS)} is "
                         "missing; there is nothing measured to fit.")
@@ -53,11 +54,11 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
             outputs[c] = np.where(again, np.nan, y)
             said.append(f"'{places[c].column}' ({c}) was read more often than it was measured: of {len(y)} samples "
                         f"{np.count_nonzero(again)} repeat the one before and do not count.")
-    used = {p.column for p in layout.places.values()}
     extra = {c: a[rows] for c, a in columns.items() if c not in used}
     if set(texts) - used:
         said.append(f"left out columns of text: {', '.join(sorted(set(texts) - used))}.")
-    parts = [*meta.get("parts", ()), *_runs_by_column({**texts, **columns}, rows, t, said)]
+    free = {c: x for c, x in {**texts, **columns}.items() if c not in used}
+    parts = [*meta.get("parts", ()), *_runs_by_column(free, rows, t, said)]
     begins = {PARTS[0]: begun, PARTS[1]: np.subtract(parts, np.median(np.diff(t)) / 2)}
     extra |= {c: np.searchsorted(times, t, "right") for c, times in begins.items() if len(times)}
     facts = {**meta, "notes": said, "extra": extra, "columns": {c: p.column for c, p in layout.places.items()},

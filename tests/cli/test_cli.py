@@ -620,11 +620,12 @@ def test_a_diagnosis_is_told_from_a_fit(tmp_path):
 def test_the_next_command_reads_the_records_as_the_diagnosis_did(verdict, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["motorid", "diagnose", "run.csv"])
     text = ("The voltage acts 5 ms earlier than it was logged: with --delay=-0.005 the error falls (speed 50 → 2 %), "
-            "and this diagnosis uses it. 3 samples are left out: with --no-spikes the error falls (speed 2 → 1 %).")
+            "and this diagnosis uses it. It is linear: with --hold linear the error falls (speed 3 → 2 %), and this "
+            "diagnosis uses it. 3 samples are left out: with --no-spikes the error falls (speed 2 → 1 %).")
     last = SimpleNamespace(mostly_noise=False, model=mi.dc_motor() + mi.effects.coulomb)
     found = SimpleNamespace(stopped="", suggestion=None, remainder=None, verdict=verdict, after=last, text=text,
                             effects=("coulomb",) if verdict == "missing" else ())
-    assert "--delay=-0.005 --no-spikes --json fit.json" in _next_step(found)
+    assert "--delay=-0.005 --hold=linear --no-spikes --json fit.json" in _next_step(found)
 
 
 def test_a_voltage_of_zero_is_said_and_no_arithmetic(tmp_path):
