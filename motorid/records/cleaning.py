@@ -57,8 +57,7 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     extra = {c: a[rows] for c, a in columns.items() if c not in used}
     if set(texts) - used:
         said.append(f"left out columns of text: {', '.join(sorted(set(texts) - used))}.")
-    free = {c: x for c, x in {**texts, **columns}.items() if c not in used}
-    parts = [*meta.get("parts", ()), *_runs_by_column(free, rows, t, said)]
+    parts = [*meta.get("parts", ()), *_runs_by_column({**texts, **{c: columns[c] for c in extra}}, rows, t, said)]
     begins = {PARTS[0]: begun, PARTS[1]: np.subtract(parts, np.median(np.diff(t)) / 2)}
     extra |= {c: np.searchsorted(times, t, "right") for c, times in begins.items() if len(times)}
     facts = {**meta, "notes": said, "extra": extra, "columns": {c: p.column for c, p in layout.places.items()},
