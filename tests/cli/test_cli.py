@@ -633,4 +633,6 @@ def test_a_voltage_of_zero_is_said_and_no_arithmetic(tmp_path):
     path = write_csv(run.with_(inputs={"v": 0 * run.inputs["v"]}), tmp_path / "zero.csv")
     done = motorid("diagnose", path)
     assert done.status == 0, done.err
-    assert "the voltage" in done.out
+    assert "the voltage is 0 V from beginning to end" in done.out
+    assert "Unexplained: " in done.out
+    assert "Missing:" not in done.out
