@@ -10,9 +10,8 @@ has 1 to 240 bytes and holds neither ``$`` nor ``*``, so a reader finds its feet
 
 From the device
     ``H,1,<name>,<rate_Hz>,<counter bits>,<timer bits>,<V_max V>,<I_max A>,<most segments>,<channel>…``
-        The header. A channel is ``name:unit:scale:offset:kind``, its value in SI ``scale·(raw − offset)``;
-        kind is ``n`` (a number), ``a12`` (a 12-bit converter, whose end values mean *clipped*) or ``w16`` (a
-        counter that wraps after 16 bits, two's complement or not).
+        The header. A channel is ``name:unit:scale:offset:kind``, its value in SI ``scale·(raw − offset)``; kind: ``n``
+        (a number), ``a12`` (12 bits, whose end values mean *clipped*) or ``w16`` (a counter that wraps after 16 bits).
     ``D,<counter>,<time µs>,<raw>…``
         One sample, raw values in the order of the channels, integer or decimal, empty where missing. ``v`` is the
         voltage commanded *from* this instant on, the other channels are measured *at* it. Counter and timer wrap.
@@ -26,8 +25,7 @@ From the computer
     segment of the excitation (see `motorid.acquire.excitation`) · ``G,<segments>`` go, once per ``L`` · ``X``
     stop · ``K`` still here; a device at rest answers it with its last ``E,done``.
 
-A device that hears no valid frame for one second switches the motor off. Repeating a command does no harm, so
-a lost answer is mended by asking again.
+A device that hears no valid frame for one second switches the motor off. A command may be repeated without harm.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
 """Is anything missing at all? Residuals against the noise and against what the motor was doing.
 
-Coloured noise, quantisation and outliers make residuals large or smooth without anything missing, so neither
-their size nor their autocorrelation decides. What does is whether they depend on the motion: residuals are binned
-over speed, current, voltage and angle, and the share of variance that the bins explain is compared with the same
-after shifting the residuals in time against the motion, which keeps the colour of both and breaks every real
-dependence (a circular-shift surrogate test, Theiler et al., Physica D 58, 1992). The library's scores, judged on
-effective samples, see what bins cannot. Where both are silent but the errors exceed the noise, `judgement`
-asks whether a free form predicts them on data that it was not fitted to: coloured noise cannot be predicted.
+Coloured noise, quantisation and outliers make residuals large or smooth without anything missing. What tells is whether
+they depend on the motion: they are binned over speed, current, voltage and angle, and the share of variance that bins
+explain is compared with the same after a shift in time against the motion, which keeps the colour of both and breaks
+every real dependence (a circular-shift surrogate test, Theiler et al., Physica D 58, 1992). The library's scores, on
+effective samples, see what bins cannot. Where both are silent but the errors exceed the noise, `judgement` asks whether
+a free form predicts them on data that it was not fitted to: coloured noise cannot be predicted.
 """
 
 from collections.abc import Mapping, Sequence

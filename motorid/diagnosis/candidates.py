@@ -97,10 +97,10 @@ def _in_doubt(node: Node, children: Sequence[Node]) -> bool:
 
 def library(effects: Iterable[Effect | str] | None, also: Iterable[Effect] = ()) -> list[Effect]:
     """Return the effects to try: the whole library, or those named, and the user's own."""
-    named = [*LIBRARY, *MEASURED, *PER_RUN] if effects is None else effects
-    chosen = [get(e) if isinstance(e, str) else e for e in named]
-    own = {e.name: e for e in also}  # in the place of one of the library with the same name
-    return [e for e in chosen if e.name not in own] + list(own.values())
+    named = [*LIBRARY, *MEASURED, *PER_RUN] if effects is None else [effects] if isinstance(effects, str) else effects
+    chosen, others = ([get(e) if isinstance(e, str) else e for e in some] for some in (named, also))
+    own = {e.name: e for e in others}  # in the place of one of the library with the same name
+    return [e for e in chosen if e.name not in own] + others
 
 
 class Search:
@@ -169,10 +169,14 @@ class Search:
         if begun and not self.stopped and _in_doubt(node, [c for c, _ in found.values() if c is not None]):
             later = dict(zip(begun, completed(list(begun.values()), self.map), strict=True))
             found |= {t.name: self._judge(node, t.added, later[t.name]) for t in tasks if t.name in later}
-        inside = {name for c, _ in found.values() if c is not None and c.objection for e in c.fit.model.effects
-                  if e.name == c.added for name in e.includes if name not in found}
-        again = [Task(node.fit, present + s.effect, s.effect, s.starts, s.drop) for s in scores if not self.stopped
-                 and s.effect.name in inside and s.starts]  # what is refused may hide the simpler one of its kind
+        gains = {c: evidence(node, c).gain for c, _ in found.values() if c is not None}
+        most = max((gain for c, gain in gains.items() if not c.objection), default=-np.inf)
+        # What is refused may hide the simpler one of its kind: what leads, also one that lost the race.
+        inside = {name: c.fit.values for c, gain in gains.items() if c.objection for e in c.fit.model.effects
+                  if e.name == c.added for name in e.includes if name not in found
+                  or (gain > most and isinstance(fits.get(name), GivenUp))}
+        again = [Task(node.fit, present + s.effect, s.effect, [{**s.starts[0], **inside[s.effect.name]}, *s.starts],
+                      s.drop) for s in scores if not self.stopped and s.effect.name in inside and s.starts]
         found |= {t.name: self._judge(node, t.added, f) for t, f in zip(again, self._refits(again), strict=True)}
         children = [child for child, _ in found.values() if child is not None]
         tried = sorted((candidate for _, candidate in found.values()), key=lambda c: c.gain or 0.0)

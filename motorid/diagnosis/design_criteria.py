@@ -1,8 +1,7 @@
 """What a voltage would tell about rival models, its gradient, and the search for the best.
 
-The unknowns are voltage levels. Each rival is driven by them through the discrete step of the fits, whose exact
-derivatives carry the slopes with respect to levels and parameters over the record. What earlier records tell about the
-parameters enters as a Gaussian prior with their information matrix (Gauss-Newton).
+The unknowns are voltage levels. The exact derivatives of the discrete step of the fits carry slopes by levels and by
+parameters over the record. What earlier records tell enters as a Gaussian prior with their information matrix.
 
 - Distinguishing (T-optimality: Atkinson & Fedorov, Biometrika 62, 1975): the χ² that is left between the predictions of
   two rivals after **both** have moved their parameters as far as old and new records let them. At that minimum the

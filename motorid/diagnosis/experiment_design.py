@@ -293,6 +293,8 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     at_least(0, budget=budget)
     rivals, goal = _rivals(found, goal)
     asked = tuple(chosen(parameters, rivals[0].model.free_names, "free parameter")) if goal == "sharpen" else ()
+    if goal == "sharpen" and not asked:
+        raise UsageError("the model has no free parameter to sharpen; free some with model.free(…).")
     _check_words(shape, levels, slew)
     seen = rivals[0].seen
     dt, duration = float(f"{dt or seen['dt']:.9g}"), duration or seen["duration"]

@@ -1,9 +1,8 @@
 """Does a free form predict better than a model, in an effect's place or beside all? What may an effect then be called?
 
-A free form is any smooth function of one quantity, in one balance or sensor (see `free_forms`). Its answer is
-linear in its coefficients, so what a model with it would predict of blocks left out follows from slopes alone. A
-parametric law that is outdone by a nonparametric one is not the thing itself (Härdle & Mammen, Ann. Statist. 21(4),
-1993); a model that no form outdoes leaves nothing that can be predicted.
+A free form is any smooth function of one quantity, in one balance or sensor (see `free_forms`), linear in its
+coefficients, so slopes alone tell what a model with it would predict of blocks left out. A parametric law that a
+nonparametric one outdoes is not the thing itself (Härdle & Mammen, Ann. Statist. 21(4), 1993).
 """
 
 import contextlib

@@ -1,9 +1,8 @@
 """The one statistic behind every decision: how well a model predicts blocks of data that it was not fitted to.
 
-Each run is cut into contiguous blocks (block cross-validation: Racine, J. Econometrics 99, 2000). What a fit would have
-predicted without a block follows from its sensitivities, without a refit: ``r_b⁽⁻ᵇ⁾ = (I − H_bb)⁻¹ r_b`` with
-``H = J(JᵀJ + s²I)⁻¹Jᵀ`` (PRESS by blocks: Allen, Technometrics 16(1), 1974), J in solver coordinates, s the scale of
-the residual: a prior of one unit, a factor of e, keeps open directions finite. Held-out blocks are predicted as is.
+Each run is cut into contiguous blocks (Racine, J. Econometrics 99, 2000). What a fit would have predicted without one
+follows without a refit: ``r_b⁽⁻ᵇ⁾ = (I − H_bb)⁻¹ r_b``, ``H = J(JᵀJ + s²I)⁻¹Jᵀ`` (PRESS by blocks: Allen, Technometrics
+16(1), 1974), J in solver coordinates, s the scale of the residual: a prior of one unit keeps open directions finite.
 
 Two models are compared by the difference of their log predictive densities, summed over blocks, and its standard error
 from their scatter (Vehtari, Gelman & Gabry, Stat. Comput. 27, 2017; Sivula et al., arXiv 2008.10296). The density is

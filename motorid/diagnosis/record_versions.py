@@ -1,15 +1,13 @@
 """What of the records a search looks at, and how it reads them.
 
-A diagnosis refits dozens of models. Of long records, samples that their neighbours predict as well as noise allows are
-left out; of what is still too long it looks at parts, contiguous and chosen so that together they show what the records
-show: both directions, slow and fast, all voltages, early and late. Every part begins where the motor then is, so that
-an angle drifts no longer than one part lasts, and runs in before it is judged: a lag remembers what was before. What
-takes longer to show (heating) is seen between the parts only.
+Of long records, samples that their neighbours predict as well as noise allows are left out; of what is still too long a
+diagnosis looks at parts, chosen so that together they show what the records show: both directions, slow and fast, all
+voltages, early and late. Every part begins where the motor then is, so that an angle drifts no longer than one part
+lasts, and runs in before it is judged: a lag remembers. What takes longer to show (heating) is seen between parts only.
 
-What was measured is right, but the voltage or single samples may not be what they seem. A logger writes the voltage of
-an instant: a digital controller holds it until the next sample, that of an amplifier goes on. A commanded one is exact,
-a measured one carries noise that the motor never saw, either may act later. Read wrongly it leaves a misfit that a lag
-or a loss of voltage seems to explain. A few spikes hide everything else.
+The voltage or single samples may not be what they seem. A logger writes the voltage of an instant: a digital controller
+holds it until the next sample, that of an amplifier goes on. A measured one carries noise that the motor never saw, any
+may act later. Read wrongly it leaves a misfit that a lag or a loss of voltage seems to explain; spikes hide all else.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -133,9 +131,9 @@ def _parts(run: Experiment, share: float) -> list[Experiment]:
     count = max(1, round(run.n * share / PART))
     if run.n < 2 * PART * count:
         return [run]
-    meta = {**part_meta(run), "part of": (run.name, run.n)}
     each = ((a, run.select(slice(max(a - RUN_IN, 0), a + PART))) for a in _telling(run, count))
-    return [part.with_(name=f"{run.name}[{k}]", meta={**meta, "judged from": run.t[a]})
+    return [part.with_(name=f"{run.name}[{k}]",
+                       meta={**part_meta(run, part), "part of": (run.name, run.n), "judged from": run.t[a]})
             for k, (a, part) in enumerate(each, 1)]
 
 
@@ -284,7 +282,7 @@ def _fall(fit: Fit, reading: Reading) -> float:
         done = by_continuation(reading.problem(fit).tuned(accuracy=ROUGH), RACE, wide=False, narrow=False)
         after = judge(at(done.problem, done.solution.q)).rmse
         return 1 - float(np.exp(np.mean([np.log(max(after[c], 1e-300) / max(e, 1e-300)) for c, e in fit.rmse.items()])))
-    except FAILURES:
+    except (MotoridError, *FAILURES):  # a run shorter than the delay
         return -np.inf
 
 

@@ -1,10 +1,9 @@
 """What data determine: the covariance of the unknowns for coloured residuals, and combinations of them.
 
-``H⁻¹ M H⁻¹`` with ``H = JᵀJ`` (Gauss-Newton) and ``M`` the covariance of ``Jᵀr``: the residuals of each channel
-are taken as stationary, with the variance they have and the autocovariance of an autoregression fitted to them,
-so neither the assumed noise level nor its whiteness matters (sandwich: White, Econometrica 50, 1982; Newey &
-West, Econometrica 55, 1987; here with a parametric Γ, since transients leave few samples to average over).
-Residuals that depend on the motion, of a model that lacks something, are not noise; then it is an indication.
+``H⁻¹ M H⁻¹`` with ``H = JᵀJ`` (Gauss-Newton) and ``M`` the covariance of ``Jᵀr``: the residuals of each channel are
+taken as stationary, with the variance they have and the autocovariance of an autoregression fitted to them, so neither
+the assumed noise level nor its whiteness matters (sandwich: White, Econometrica 50, 1982; Newey & West, Econometrica
+55, 1987; Γ is parametric, since transients leave few samples). Residuals of a model that lacks something are no noise.
 `Fit.std` is made here; `motorid.uncertainty.covariance` shows all of it.
 
 A quantity is determined if two things hold. It stays where it is along every direction that has no influence on the

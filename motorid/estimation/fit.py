@@ -116,7 +116,7 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
     if isinstance(window, int | float):
         runs = [part for run in ([runs] if isinstance(runs, Experiment) else runs) for part in windows(run, window)]
     penalties = tuple(penalties)
-    if odd := [p for p in (*penalties, *constraints) if not hasattr(p, "evaluate")]:
+    if odd := [p for p in (*penalties, *constraints) if not hasattr(p, "evaluate") or isinstance(p, type)]:
         raise UsageError(f"penalties and constraints are like mi.CurrentLimit(8), mi.Constraint(…), not {odd[0]!r}.")
     if formulation == "penalty":
         penalties, constraints = penalties + (tuple(constraints) or (SteadyState(),)), ()
@@ -173,7 +173,8 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback
 
 def check_solver(solver: Any) -> None:
     """Refuse what is no solver."""
-    if not (solver is None or isinstance(solver, LevenbergMarquardt) or hasattr(solver, "solve")):
+    if isinstance(solver, type) or not (
+            solver is None or isinstance(solver, LevenbergMarquardt) or hasattr(solver, "solve")):
         raise UsageError("solver takes mi.LevenbergMarquardt() (the default) or mi.MultipleShooting(), not a name; "
                          f"got {name_of(solver)}.")
 

@@ -1,13 +1,12 @@
 """Restarts: where an end is in doubt, from another start; where a parameter has collapsed, from where it matters.
 
-Two valleys lead far starts astray. With the electrical and the mechanical time constant swapped the speed
-comes out right and the current not at all; with hardly any resistance inductance and inertia ring. The
-first is left by letting every channel count alike at first (errors over the RMS), the second by smaller
-first steps; what resists both is begun from a place nearby. With this, 3000 starts within a factor of ten of each
-shipped motor all ended in its optimum, and 97 % within a factor of a hundred (bench_starts.py).
+Two valleys lead far starts astray: with the time constants swapped the speed comes out right and the current not at
+all; with hardly any resistance inductance and inertia ring. The first is left by errors over the RMS of each channel at
+first, the second by smaller first steps; what resists both is begun nearby. So 3000 starts within a factor of ten of
+each shipped motor all ended in its optimum, and 97 % within a factor of a hundred (bench_starts.py).
 
-A parameter that a run has driven to nothing has collapsed: on a logarithmic scale the cost is flat there,
-minimum or not. Put back to where it would matter, it comes to its value, or goes away again.
+A parameter that a run has driven to nothing has collapsed: on a logarithmic scale the cost is flat there. Put back to
+where it would matter, it comes to its value, or goes away again.
 """
 
 from collections.abc import Iterable, Mapping

@@ -184,6 +184,10 @@ class Fit(Shown):
             said += f", a window of {number(self.window, 2)} s ahead"
             said += f"; {listed(anew)} begin{'s' * (len(anew) == 1)} anew in each" if (anew := self.memories) else ""
         end = "" if self.status == "converged" else f" Not converged ({self.status}): the values are not an optimum."
+        off = {n: abs(self.values[n] - mean) / np.sqrt(sd**2 - own**2)  # as far as both alone would be apart
+               for n, (mean, sd) in self.problem.priors.items() if (own := self.std.get(n) or sd) < sd}
+        end += "".join(f" The records contradict the prior of {n} by {number(far, 2)} standard deviations."
+                       for n, far in off.items() if far > 3)
         return f"{said} (NRMSE {self.evaluation.words}).{end}"
 
     @property
@@ -309,12 +313,14 @@ class Fit(Shown):
 
     def card(self) -> Card:
         """Return how it ended, parameters, errors, and what constraints cost."""
-        vague = [n for n, s in self.std.items() if s is None]
+        vague = [n for n, s in self.std.items() if s is None and n not in self.at_bound]
         flags = [flag_of(self), *([] if self.status == "converged" else [Flag(self.status, "bad")])]
         flags += [Flag(self.formulation)] if self.formulation != "plain" else []
         flags += [Flag(f"{len(vague)} not determined", "note")] if vague else []
         amount = f"{counted(len(self.problem.experiments), 'run')}, {self.problem.n_outputs} measured values."
-        text = (self.verdict, NRMSE, f"{amount} {ended(self)}")
+        steady = any(hasattr(c, "segments") for c in (*self.problem.penalties, *self.problem.constraints))
+        text = (self.verdict, NRMSE, f"{amount} {ended(self)}", steady * (
+            "SteadyState(): every ± takes the measured means as exact, and is too small; fit without it for them."))
         after = [("mi.plot_fit(fit)", "see it"), ("mi.diagnose(fit)", "what is missing")]
         after = after if self.fits == "noise" else after[::-1]
         after += [("mi.identifiability(fit)", f"why {', '.join(vague)} cannot be determined")] if vague else []
@@ -375,7 +381,7 @@ def parameter_table(fit: Fit, before: Fit | None = None) -> Table:
     no fit determines share a row; beside another fit what is determined instead follows."""
     fits = [f for f in (before, fit) if f is not None]
     pars = [p for p in fit.model.parameters.values() if before is None or p.name != "sgn_width"]
-    open_ = [p for p in pars if p.vary and all(f.std.get(p.name) is None for f in fits)]
+    open_ = [p for p in pars if p.vary and all(f.std.get(p.name) is None and p.name not in f.at_bound for f in fits)]
     rows = [[p.name, *(parameter_cell(f, p.name) for f in fits), *([p.doc] if before is None else [])]
             for p in pars if p not in open_]
     if open_:
@@ -401,7 +407,8 @@ def parameter_cell(fit: Fit, name: str) -> Cell:
     if name == "sgn_width" and not p.given:
         return f"{quantity(fit.values[name], p.unit, 2)} (chosen from the data)"
     if p.vary and fit.std[name] is None:
-        return Flag("not determined", "note")
+        at = with_error(fit.values[name], None, p.unit, "at its limit")
+        return Flag(at if name in fit.at_bound else "not determined", "note")
     return with_error(fit.values[name], fit.std[name], p.unit)
 
 

@@ -27,23 +27,20 @@ def fit_dict(fit: Fit, held_out: Evaluation | None = None) -> dict[str, Any]:
         return all(std.get(n) is not None for n in names if n in std)
 
     engine = problem.engine if isinstance(problem.engine, str) else problem.engine.name
+    same = ("fits", "verdict", "chi2", "dof", "status", "message", "iterations", "seconds", "formulation",
+            "integration_error", "per_run", "initial", "window", "steady_state_error")
     return {
         "model": {"base": model.base, "axis": model.axis, "effects": list(model.effect_names)},
         "parameters": {n: {"value": fit.values[n], "std": std[n] if p.vary else 0.0, "unit": p.unit,
                            "fixed": not p.vary} for n, p in model.parameters.items()},
-        "fits": fit.fits, "verdict": fit.verdict,
+        **{n: getattr(fit, n) for n in same}, "nrmse": dict(fit.nrmse), "rmse": dict(fit.rmse), "engine": engine,
         "determined": {n: {"value": d.value, "std": d.std, "unit": d.unit} for n, d in fit.determined.items()},
-        "nrmse": dict(fit.nrmse), "rmse": dict(fit.rmse),
-        "validation_nrmse": dict(held_out.nrmse) if held_out else None,
-        "validation_rmse": dict(held_out.rmse) if held_out else None, "chi2": fit.chi2, "dof": fit.dof,
-        "status": fit.status, "message": fit.message, "iterations": fit.iterations, "seconds": fit.seconds,
-        "engine": engine, "formulation": fit.formulation, "integration_error": fit.integration_error,
+        **{f"validation_{n}": dict(getattr(held_out, n)) if held_out else None for n in ("nrmse", "rmse")},
         "derived": {"tau_e": fit.tau_e if known("R", "L") else None, "tau_m": fit.tau_m if known(*MOTOR) else None,
                     "damping": fit.damping if known(*MOTOR) else None},
-        "steady_state_error": dict(fit.steady_state_error), "violations": constraint_violations(fit),
+        "violations": constraint_violations(fit),
         "multipliers": [{"constraint": m.name, "value": m.value, "unit": m.unit, "active": m.active}
                         for m in fit.extra.get("multipliers", ())],
-        "per_run": fit.per_run, "initial": dict(fit.initial), "window": fit.window,
         "runs": [run_dict(r) | {"nrmse": dict(e)}
                  for r, e in zip(problem.experiments, fit.evaluation.by_run, strict=True)],
         "remarks": remarks(fit)}
@@ -67,8 +64,8 @@ def remarks(fit: Fit) -> list[str]:
     model, measured, std = fit.problem.model, fit.problem.outputs, fit.std
     undetermined = {n: model.parameters[n] for n in model.free_names if std[n] is None}
     vague = [n for n, p in undetermined.items() if p.lower < fit.values[n] < p.upper]
-    at_limit = [f"{n} ended at {fit.values[n]:.3g}, the limit of what is physical: these records show no sign of it."
-                for n in undetermined if n not in vague]
+    at_limit = [f"{n} ended at its limit, {quantity(fit.values[n], p.unit)}: these records show no sign of it, or ask "
+                "for what lies beyond." for n, p in undetermined.items() if n not in vague]
     said = []
     motor = [n for n in vague if n in MOTOR]
     if model.base == "dc_motor" and motor and ("i" not in measured or not {"omega", "theta"} & set(measured)):

@@ -105,8 +105,11 @@ class Model(Shown):
         return self._change({n: {"vary": True} for n in names})
 
     def bounded(self, **limits: tuple[float, float]) -> Model:
-        """Return the model with limits set: ``bounded(R=(0.5, 2))``."""
-        return self._change({n: {"lower": float(lo), "upper": float(hi)} for n, (lo, hi) in limits.items()})
+        """Return the model with limits set, ``bounded(R=(0.5, 2))``; a value that nobody gave moves between them."""
+        moved = {n: {"value": min(max(p.value, float(limits[n][0])), float(limits[n][1]))}
+                 for n, p in self.parameters.items() if n in limits and not p.given}
+        return self._change({n: {"lower": float(lo), "upper": float(hi)} | moved.get(n, {})
+                             for n, (lo, hi) in limits.items()})
 
     @property
     def effect_names(self) -> tuple[str, ...]:

@@ -1,18 +1,15 @@
 """Levenberg-Marquardt on whitened residuals with exact Jacobians.
 
-The damped step solves ``min ‖J d + r‖² + λ‖D d‖²`` by a QR factorisation of J (never JᵀJ). A residual that
-cannot be computed counts as a bad step: it is shortened, and the fit goes on. Variables at a bound whose
-gradient points outward are held for the step. λ = 0 is the Gauss-Newton step.
+The damped step solves ``min ‖J d + r‖² + λ‖D d‖²`` by a QR factorisation of J (never JᵀJ); λ = 0 is Gauss-Newton's. A
+residual that cannot be computed shortens the step. Variables at a bound with an outward gradient are held for the step.
 
 Why it arrives from far away. On the logarithmic scale a positive parameter that runs to zero or to infinity loses its
-influence, and the plateau behind it looks like a minimum. The usual D, the column norms of J (Moré, "The
-Levenberg-Marquardt algorithm", 1978), hardly brakes a parameter of little influence: a first step that is right for the
-others throws it onto the plateau. Here D = ‖r‖ on a logarithmic scale: a change by a factor of e costs λ times the
-present misfit, whatever the parameter, so parameters that the misfit does not ask for stay where they are until their
-turn comes. Damping in proportion to ‖r‖² makes the method converge globally and quadratically even where J is singular
-(Yamashita & Fukushima, Computing Suppl. 15, 2001; Fan & Yuan, Computing 74, 2005), and it fades as the misfit does. λ
-follows the gain ratio (Nielsen, report IMM-REP-1999-05). Of 100 starts within a factor of ten 99 end in the optimum,
-75 to 94 with the column norms. What is left is caught by restarts, see `motorid.estimation.restarts`.
+influence, and the plateau behind it looks like a minimum. The usual D, column norms of J (Moré, 1978), hardly brakes
+it: a first step that is right for the others throws it there. Here D = ‖r‖: a change by a factor of e costs λ times the
+present misfit, so parameters that the misfit does not ask for stay where they are until their turn comes. Damping in
+proportion to ‖r‖² makes the method converge globally and quadratically even where J is singular (Yamashita & Fukushima,
+Computing Suppl. 15, 2001; Fan & Yuan, Computing 74, 2005). λ follows the gain ratio (Nielsen, IMM-REP-1999-05). Of 100
+starts within a factor of ten 99 end in the optimum, 75 to 94 with the column norms; see `motorid.estimation.restarts`.
 """
 
 from __future__ import annotations

@@ -121,17 +121,13 @@ def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
     """Return the standard deviation of the measurement noise of samples `y` (N,), NaN where missing, at times `t` in s,
     evenly spaced without them. It is always positive: 1.0 for a channel that is zero throughout.
 
-    High-order differences remove the signal, which is smooth over a few samples, and keep the noise; averaging the
-    smaller half of them ignores outliers and the few samples after a voltage step. On uneven samples the weights are
-    those of divided differences, so missing and jittering samples do no harm. The order starts at two and grows as
-    long as that removes more signal. Parts in which nothing changes at all are left out, and so is what a sensor that
-    measures every few samples repeats meanwhile. The result is never below what rounding alone does (step/√12, where
-    the channel moves in steps), nor below 1e-5 of the channel's variation. Noise that is itself smooth is
-    underestimated: by a factor of about four for first-order noise with a correlation of 0.9 between neighbours. A
-    signal that never rests and has only two or three samples per time constant is overestimated.
-
-    Gasser, Sroka and Jennen-Steinmetz, "Residual variance and residual pattern in nonlinear regression",
-    Biometrika 73(3), 1986; Hall, Kay and Titterington, Biometrika 77(3), 1990.
+    High-order differences remove the signal, smooth over a few samples, and keep the noise; a mean of the smaller half
+    ignores outliers and the samples after a voltage step. Uneven samples are weighed as in divided differences. The
+    order starts at two and grows as long as that removes more signal. Parts in which nothing changes are left out, and
+    so is what a sensor that measures every few samples repeats. The result is never below what rounding alone does
+    (step/√12, where the channel moves in steps), nor 1e-5 of the channel's variation. Smooth noise is underestimated
+    (four times, with a correlation of 0.9 between neighbours), two or three samples per time constant overestimated.
+    Gasser, Sroka and Jennen-Steinmetz, Biometrika 73(3), 1986; Hall, Kay and Titterington, Biometrika 77(3), 1990.
     """
     values = np.asarray(y, dtype=float)
     times = np.arange(values.size, dtype=float) if t is None else np.asarray(t, dtype=float)

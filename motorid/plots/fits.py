@@ -240,7 +240,7 @@ def plot_parameters(*results: Any, truth: Mapping[str, float] | None = None,
     chosen = list(names or dict.fromkeys(n for f in fits for n, p in f.model.parameters.items() if p.vary))
     for name in chosen:
         among(name, dict.fromkeys(n for f in fits for n in f.values), "parameter")
-    columns = {6: 3, 7: 4, 8: 4}.get(len(chosen), min(len(chosen), 5))
+    columns = {6: 3, 7: 4, 8: 4}.get(len(chosen), min(len(chosen), 5) or 1)
     axes = style.panels(len(chosen), columns, row=1.75, width=style.WIDTH * max(columns, 3) / 5)
     for ax, name in zip(axes, chosen, strict=True):
         _one_parameter(ax, fits, name, (truth or {}).get(name))

@@ -140,6 +140,8 @@ def _cleaned(svg: str, name: str, alt: str) -> str:
 
 def grid(rows: int, columns: int, *, row: float = 1.6, width: float = WIDTH, **options: Any) -> np.ndarray:
     """Return axes (rows, columns) on a new figure; `row` is the height of a row in inches."""
+    if not rows * columns:
+        raise UsageError("there is nothing to draw: every parameter is fixed; free some with model.free(…).")
     total = row * sum(options.get("height_ratios", [1.0] * rows))
     return new_figure(width, total + 0.35).subplots(rows, columns, squeeze=False, **options)
 

@@ -189,21 +189,20 @@ class CurrentLimit(Relation):
 class SteadyState(Relation):
     """The model's own balances vanish at the measured steady state.
 
-    The measured means of current and speed are put into the voltage and the torque balance; sensor effects
-    are undone first, states that were not measured come from the simulation. For the plain motor that is
-    ``v = R i + K ω`` and ``K i = b ω``; with effects the relation grows with the model. Steady parts are
-    found in the data, see `segments`. At standstill only the voltage balance is used.
+    The measured means of current and speed are put into the voltage and the torque balance; sensor effects are undone
+    first, states that were not measured come from the simulation. For the plain motor that is ``v = R i + K ω`` and
+    ``K i = b ω``; with effects the relation grows with the model. Steady parts are found in the data, see
+    `segments`. At standstill only the voltage balance is used. Standard deviations take the means as exact: too small.
 
     Attributes
     ----------
     tolerance : float
-        As a true constraint: largest balance left over, relative to v and to K i (g v where the drive makes
-        the torque); three standard errors of the measured means are added.
+        As a true constraint: largest balance left over, relative to v and K i (or g v), and three standard errors of
+        the measured means.
     weight : float
-        As a penalty each balance adds ``weight·√n·(relative balance)``, n being the samples of the segment,
-        to a residual in units of the RMS of the measured channels (in a fit weighted by the noise: times the
-        ratio of that RMS to the noise). So a balance that is off by 1 % weighs as much as one channel off by
-        1 % of its RMS all through the segment.
+        As a penalty each balance adds ``weight·√n·(relative balance)``, n being the samples of the segment, to a
+        residual in units of the RMS of the measured channels (in a fit weighted by the noise: times its ratio to the
+        noise): one off by 1 % weighs as much as a channel off by 1 % of its RMS all through the segment.
     at : sequence of (run, begin, end), optional
         Steady parts given by the user, times in s, instead of those found.
 

@@ -95,7 +95,8 @@ def angle_signal(run: Experiment) -> Array:
     """Return the angle from the measurements, (N,): the measured one, bridged over gaps, or ∫ω dt."""
     if "theta" in run.outputs:
         return bridged(run.t, run.outputs["theta"])
-    return integral(run.t, bridged(run.t, run.outputs["omega"])) if "omega" in run.outputs else np.zeros(len(run.t))
+    moved = integral(run.t, bridged(run.t, run.outputs["omega"])) if "omega" in run.outputs else np.zeros(len(run.t))
+    return moved + run.meta.get("travelled", 0.0)
 
 
 def noise_of(runs: Sequence[Experiment], channels: Sequence[str]) -> dict[str, float]:
@@ -131,7 +132,7 @@ def initial_state(run: Experiment, sigma: Mapping[str, float],
     among(initial, INITIAL, "initial state")
     rest, lead = at_rest(run, sigma)
     known = rest if initial == "auto" else initial == "rest"
-    start, reach = np.zeros(3), {}
+    start, reach = np.array([0.0, 0.0, run.meta.get("travelled", 0.0)]), {}
     for k, c in enumerate(CHANNELS):
         if c not in sigma:  # not measured, or not shown by the model
             continue
@@ -187,7 +188,8 @@ def _lead(run: Experiment) -> int:
 def _may_rest(run: Experiment, sigma: Mapping[str, float], lead: int) -> bool:
     """Tell whether neither current nor speed speak against rest at the first samples."""
     # With the voltage on from the first sample, a motor at rest moves at the second: there both tell at the first.
-    checked = max(lead, 1 if {"i", "omega"} <= sigma.keys() else 2)
+    # A motor that comes to rest before the first voltage tells only then, too.
+    checked = min(max(lead, 1 if {"i", "omega"} <= sigma.keys() else 2), FIRST)
     for c in ("i", "omega"):
         if c in sigma:
             y = run.outputs[c][:checked]

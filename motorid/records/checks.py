@@ -222,7 +222,7 @@ def _excitation(run: Experiment) -> str | None:
                     "column, was it not logged, or does a load drive it? Say which one holds it, columns={'v': ...}, "
                     "or leave the run out.")
     return (f"the voltage is {quantity(v[0], run.units['v'])} from beginning to end: such a run shows one "
-            "steady speed and at most a start. Add runs with steps or a sweep of the voltage."
+            "steady speed, and the way there at most. Add runs with steps or a sweep of the voltage."
             ) if np.ptp(v) <= 1e-6 * np.abs(v).max() else None
 
 
@@ -696,8 +696,7 @@ class _Balances:
     from the first sample on since noise hides small steps of the speed: ω = ω₀ + k∫(i − load) − b∫ω − c∫sgn ω, solved
     for ω and for ∫i, as either may be the small difference of large terms: the speed of a motor that lifts slowly is.
     The load is a constant, a weight (sin θ, cos θ with θ = ∫ω), of `LOAD` times the largest current at most, and what
-    friction takes up at standstill. An unlimited weight would explain anything: swung by small angles it is a spring,
-    and a spring does to the current what an inertia does to the speed.
+    friction takes up at standstill. A weight without limit is a spring, to the current what an inertia is to the speed.
     """
 
     def __init__(self, run: Experiment, outputs: Sequence[Array]) -> None:

@@ -19,7 +19,7 @@ from motorid.channels import CHANNELS, MEASURED_INPUTS, NAMES, UNITS
 from motorid.display.cards import Card, Flag, Shown, Table
 from motorid.display.numbers import duration, number, quantity
 from motorid.errors import DataError, UsageError, among, printable
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, bridged, integral
 from motorid.records import preprocessing
 
 INPUTS = ("v", *MEASURED_INPUTS)
@@ -264,15 +264,20 @@ def windows(experiment: Experiment, seconds: float) -> list[Experiment]:
         raise UsageError(f"a window takes a time in seconds; got {seconds!r}.")
     if seconds < 8 * experiment.dt:
         raise UsageError(f"a window of {seconds:g} s holds fewer than 8 samples, {experiment.dt:.3g} s apart.")
-    return [p.with_(meta={**part_meta(r), **p.meta, "window": seconds, "judged from": p.t[0]})
+    return [p.with_(meta={**part_meta(r, p), "window": seconds, "judged from": p.t[0]})
             for r in between_pauses(experiment)
             for p in split(r, max(min(round(r.duration / seconds), r.n // MIN_SAMPLES), 1))]
 
 
-def part_meta(run: Experiment) -> dict[str, Any]:
-    """Return what a part of a run, simulated from its own state, keeps: which record it is of, where that began."""
-    origin = {"origin": float(run.outputs["theta"][0] - run.moved("theta")[0])} if "theta" in run.outputs else {}
-    return {**run.meta, "record": record_of(run), **origin}
+def part_meta(run: Experiment, part: Experiment) -> dict[str, Any]:
+    """Return what a part of a run, simulated from its own state, keeps: its record, where that began, how far it is."""
+    begun = dict[str, float]()
+    if "theta" in run.outputs:
+        begun["origin"] = float(run.outputs["theta"][0] - run.moved("theta")[0])
+    elif "omega" in run.outputs:
+        angle = np.interp(part.t[0], run.t, integral(run.t, bridged(run.t, run.outputs["omega"])))
+        begun["travelled"] = run.meta.get("travelled", 0.0) + float(angle)
+    return {**run.meta, **part.meta, "record": record_of(run), **begun}
 
 
 def record_of(run: Experiment) -> str:

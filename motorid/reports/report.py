@@ -38,7 +38,7 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
     ----------
     result : Fit, Diagnosis, Ladder, any other result, or a sequence of them
     path : str or Path
-        File to write; its folder must exist.
+        File to write; its folder is made where there is none.
     title : str, optional
     command : str, optional
         The command or code that made it, for the last section.

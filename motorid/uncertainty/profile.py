@@ -214,9 +214,8 @@ class Intervals(Printed):
     def to_dict(self) -> dict[str, Any]:
         """Return plain data: per parameter value, status and the three intervals."""
         return {"level": self.level, "parameters": {
-            n: {"value": p.value, "unit": p.unit, "status": self.covariance.status[n],
-                "covariance": self.covariance.interval(n, self.level),
-                "bootstrap": self.bootstrap.interval(n, self.level),
+            n: {"value": p.value, "unit": p.unit, "status": self.covariance.status[n], **{
+                k: getattr(self, k).interval(n, self.level) for k in ("covariance", "bootstrap")},
                 "profile": p.to_dict(self.level)["interval"]} for n, p in self.profiles.items()}}
 
     def card(self) -> Card:

@@ -15,6 +15,7 @@ from battery.excite import driven, record
 
 import motorid as mi
 from motorid.diagnosis.adequacy import adequacy
+from motorid.diagnosis.candidates import library
 from motorid.diagnosis.design_criteria import Rival
 from motorid.diagnosis.locate import accounted, binned
 from motorid.diagnosis.score_test import rank, score
@@ -378,6 +379,15 @@ def test_nothing_is_added_beyond_the_limit(rubbing, plain):
 def test_an_effect_that_is_not_known_is_named_with_the_nearest(plain):
     with pytest.raises(ModelError, match="coulomb"):
         mi.diagnose(plain, effects=("coulom",))
+    with pytest.raises(ModelError, match="unknown effect 'coulom'"):
+        mi.diagnose(plain, effects="coulom")
+    assert [e.name for e in library("coulomb", ["gravity"])] == ["coulomb", "gravity"]
+
+
+def test_no_delay_longer_than_the_record_is_tried():
+    t = np.arange(8) * 1e-3
+    run = mi.Experiment(t, {"v": np.where(t < 2e-3, 0.0, 4.0)}, {"i": np.array([0, 0, 0, 1, 1.6, 2, 2.1, 1.8])})
+    assert mi.diagnose(mi.fit(mi.dc_motor(), run)).verdict in ("missing", "unexplained", "adequate")
 
 
 def test_the_users_own_effect_wins_where_it_is_the_truth(lab):

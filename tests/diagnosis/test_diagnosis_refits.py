@@ -729,3 +729,33 @@ def test_a_voltage_that_acts_earlier_and_then_later_is_one_delay(lab, monkeypatc
         told = climbed.call_args.args[0].remarks
         assert len(told) == len(remarks)
         assert all(said in remark for said, remark in zip(remarks, told, strict=True))
+
+
+def test_what_leads_and_is_refused_gives_its_values_to_a_simpler_one_that_lost_the_race(monkeypatch):
+    """Bristles as stiff as they may be are a breakaway without any, which a poor start had left behind."""
+    rng, t, runs = np.random.default_rng(0), np.arange(600) * 2e-3, []
+    motor = mi.dc_motor(R=2.2, L=1.4e-3, K=0.3, b=5e-3, J=2e-3) + mi.effects.stribeck(tau_c=0.1, tau_s=0.18, omega_s=3)
+    for _ in range(2):
+        still = mi.Experiment(t, {"v": np.repeat(rng.uniform(-10, 10, 20), 30)}, {"i": 0 * t, "omega": 0 * t})
+        shown = mi.simulate(motor, still, initial="rest")[0].outputs
+        runs.append(still.with_(outputs={"i": shown["i"] + 0.01 * rng.normal(size=600),
+                                         "omega": shown["omega"] + 0.1 * rng.normal(size=600)}))
+    asked = []
+
+    def lost_at_first(tasks, map_):
+        others = tasks[1:] if not asked else tasks
+        asked.extend(tasks)
+        return [trial.GivenUp(trial.LESS)] * (len(tasks) - len(others)) + trial.refits(others, map_)
+
+    monkeypatch.setattr(search, "refits", lost_at_first)
+    monkeypatch.setattr(search, "_in_doubt", lambda *_: False)
+    effects = search.library(("stribeck", "lugre"))
+    tried = search.Search(mi.fit(mi.dc_motor(), runs), None, effects, search.Stages())
+    children, _ = tried.expand(tried.root)
+    assert [task.name for task in asked][::2] == ["stribeck", "stribeck"]
+    refused = next(c for c in children if c.added == "lugre")
+    assert "theta_s runs to its limit" in refused.objection
+    assert asked[-1].starts[0]["tau_c"] == refused.fit.values["tau_c"]
+    found = next(c for c in children if c.added == "stribeck")
+    assert not found.objection
+    assert found.fit.values["tau_s"] == pytest.approx(0.18, rel=0.03)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +15,7 @@ from motorid.errors import FitError, SimulationError, UsageError
 from motorid.estimation import least_squares
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.fit import no_worse_than_smaller
+from motorid.exporters.json_file import remarks
 from motorid.integrate import Rosenbrock
 from motorid.integrate.rosenbrock import Stepper
 from motorid.problem import problem as problem_module
@@ -167,6 +169,11 @@ def test_limits_are_kept_and_a_value_at_its_limit_has_no_uncertainty(runs):
     assert fit.values["R"] == pytest.approx(1.6, rel=1e-12)
     assert fit.std["R"] is None
     assert fit.status == "converged"
+    card = " ".join(str(fit.card()).split())
+    assert "R 1.6 Ω (at its limit)" in card
+    assert "not determined" not in card
+    (said,) = remarks(fit)
+    assert said == "R ended at its limit, 1.6 Ω: these records show no sign of it, or ask for what lies beyond."
     held = mi.fit(mi.dc_motor().fix(R=1.6), runs)
     for n in ("L", "K", "b", "J"):
         assert fit.values[n] == pytest.approx(held.values[n], rel=1e-4)
@@ -203,6 +210,10 @@ def test_a_prior_pulls_as_its_width_says(runs):
     assert moved == pytest.approx([1.0, 0.5, 0.0], abs=0.05)
     assert alike.std["R"] == pytest.approx(std / np.sqrt(2), rel=0.1)
     assert alike.chi2 < 2 * alike.cost  # the prior is part of the cost and not of chi2
+    far = re.search(r"The records contradict the prior of R by (\S+) standard deviations", tight.verdict)
+    assert far is not None
+    assert float(far[1]) == pytest.approx(4, rel=0.05)
+    assert not any("prior" in fit.verdict for fit in (plain, alike, loose))  # as wide: 2.8
 
 
 def test_a_prior_supplies_what_the_record_cannot_tell(rng):

@@ -47,6 +47,13 @@ def test_table_shows_everything(compared):
         assert word in text, word
 
 
+def test_means_that_are_taken_as_exact_are_said():
+    runs = runs_of("two_step_noisy")
+    weighed, plain = (mi.fit(mi.dc_motor(), runs, penalties=p) for p in ([SteadyState()], [CurrentLimit(50.0)]))
+    said = "every ± takes the measured means as exact"
+    assert (said in str(weighed.card()), said in str(plain.card())) == (True, False)
+
+
 def test_a_formulation_that_fails_is_a_value():
     compared = compare_formulations(mi.fit(mi.dc_motor(), runs_of("two_step_noisy")), [CurrentLimit(0.1)])
     assert isinstance(compared.hard.result, Failure)

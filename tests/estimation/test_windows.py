@@ -111,6 +111,25 @@ def test_windows_of_a_length_that_was_asked_for(records):
         mi.fit(PENDULUM, records[1], window=1e-3)
 
 
+def test_a_window_begins_where_the_motor_has_got_to_though_only_its_speed_tells():
+    """Against a spring every window would begin with the spring at rest."""
+    rng, t = np.random.default_rng(3), np.arange(0, 2, 1e-3)
+    motor = mi.dc_motor(R=1.4, L=1.8e-3, K=0.047, b=2e-4, J=2.3e-5) + mi.effects.spring(k_s=3e-3, theta_0=1.0)
+    still = mi.Experiment(t, {"v": 4 * np.sin(2 * np.pi * (0.5 + t) * t)}, {"i": 0 * t, "omega": 0 * t})
+    shown = mi.simulate(motor, still, initial="rest")[0]
+    noise = {"i": 0.02, "omega": 0.3}
+    run = still.with_(outputs={c: shown.outputs[c] + s * rng.normal(size=len(t)) for c, s in noise.items()})
+    parts = windows(run, 0.5)
+    begun = [np.interp(p.t[0], t, shown.states["theta"]) for p in parts]
+    assert [p.meta["travelled"] for p in parts] == pytest.approx(begun, abs=0.05)
+    assert np.ptp(begun) > 1
+    assert windows(parts[1].with_(meta={k: x for k, x in parts[1].meta.items() if k != "window"}), 0.2)[0].meta[
+        "travelled"] == pytest.approx(begun[1], abs=0.05)  # of a part
+    fit = mi.fit(mi.dc_motor() + mi.effects.spring, run, window=0.5)
+    assert max(fit.misfit.values()) < 1.2
+    assert fit.values["theta_0"] == pytest.approx(1.0, abs=0.1)
+
+
 def test_the_option_of_the_command_line(tmp_path):
     run, out = str(data_path("hidden_friction") / "run1.csv"), tmp_path / "fit.json"
     done = CliRunner().invoke(app, ["fit", run, "--window", "0.2", "--json", str(out)])

@@ -37,6 +37,7 @@ def test_every_change_returns_a_copy():
     assert set_.parameters["R"].given
     assert not more.parameters["R"].given
     assert bounded.parameters["R"].lower == 0.5
+    assert more.bounded(J=(1e-4, 1e-2)).values["J"] == 1e-4  # nobody gave the 1e-5 that it had
 
 
 def test_fix_with_a_value_sets_and_holds():
@@ -295,7 +296,7 @@ def test_electrical_effects_on_a_torque_drive():
         (lambda: mi.effect(balance="thermal"), "unknown balance"),
         (lambda: mi.effect(balance="torque")(lambda m, c=1.0: None), r"'c' needs a default P\("),
         (lambda: mi.dc_motor(R=-1.0), "must be positive"),
-        (lambda: mi.dc_motor().bounded(R=(2.0, 3.0)), "outside its limits"),
+        (lambda: mi.dc_motor(R=1.0).bounded(R=(2.0, 3.0)), "outside its limits"),
     ],
 )
 def test_wrong_words_are_answered_with_the_right_ones(wrong, words):

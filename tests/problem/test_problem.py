@@ -232,6 +232,21 @@ def test_a_record_that_begins_at_rest_may_do_so_however_few_counts_tell_its_firs
     assert mi.evaluate(motor, run).rmse["i"] < 6.5e-3
 
 
+def test_a_motor_that_comes_to_rest_before_the_first_voltage_begins_in_motion(rng):
+    """Over all of the time without a voltage its median speed is next to zero."""
+    t = np.arange(1200) * 1e-3
+    v = np.where(t < 0.3, 6.0, np.where(t < 0.8, 0.0, 4.0))
+    whole = noisy(simulated(t, v, ("i", "omega")), rng)
+    run = whole.select(slice(300, None))
+    assert abs(np.median(run.outputs["omega"][:500])) < 0.01 * run.outputs["omega"][0]
+    assert [p.name for p in as_problem(TRUE, run).unknown[5:]] == ["i_0[0]", "omega_0[0]"]
+    assert mi.evaluate(TRUE, run).rmse["omega"] < 1.1 * mi.evaluate(TRUE, whole).rmse["omega"]
+    windowed = mi.fit(mi.dc_motor(), whole, window=0.3)  # one of them begins where the voltage falls to zero
+    assert max(windowed.misfit.values()) < 1.1
+    shorter = whole.select(slice(300, 800))  # nothing but the way to rest
+    assert mi.simulate(TRUE, shorter)[0].outputs["omega"][0] == pytest.approx(whole.outputs["omega"][300], rel=0.05)
+
+
 def test_a_slow_start_that_an_encoder_counts_is_motion_and_rest_is_rest(rng):
     """A controller holds a motor at a crawl, 0.4 % of its highest speed: taken as rest that is 20 counts wrong."""
     count = 2 * np.pi / 4000

@@ -28,16 +28,13 @@ KEPT = "Start_Kept"
 SAID = {
     KEPT: ("stalled", "stalled: the interior-point solver found nothing better than the least-squares fit that it "
                       "started from, which is kept; identifiability() shows which parameters are not determined"),
-    "Maximum_Iterations_Exceeded": (
-        "limit", "stopped at the largest number of iterations; raise max_iterations, or start from a least-squares "
-                 "fit: mi.fit(fit.model, …, solver=mi.MultipleShooting(warm='model'))"),
+    "Maximum_Iterations_Exceeded": ("limit", "stopped at the largest number of iterations; raise max_iterations, or "
+                                    "start from a least-squares fit: warm='model'"),
     "Infeasible_Problem_Detected": ("failed", "no nearby point satisfies all constraints"),
-    "Restoration_Failed": (
-        "failed", "the solver could not return to a point that satisfies the constraints; loosen them, or start from "
-                  "a least-squares fit with warm='model'"),
-    "Invalid_Number_Detected": (
-        "failed", "the model could not be simulated on the way; bound the parameters with model.bounded(…), or "
-                  "shorten the intervals with every=…")}
+    "Restoration_Failed": ("failed", "the solver could not return to a point that satisfies the constraints; loosen "
+                           "them, or start from a least-squares fit: warm='model'"),
+    "Invalid_Number_Detected": ("failed", "the model could not be simulated on the way; bound the parameters with "
+                                "model.bounded(…), or shorten the intervals with every=…")}
 
 
 @dataclass(frozen=True, eq=False)
