@@ -47,10 +47,9 @@ NAMES = {"v": "the voltage", "i": "the current", "omega": "the speed", "theta": 
 def adequacy(fit: Fit, scores: Sequence[Score] = (), level: float = FALSE_ALARM) -> Adequacy:
     """Judge whether the residuals of `fit` are noise, by `scores` of effects that might be added (see `rank`) too.
 
-    `FALSE_ALARM` is the probability of calling an adequate model inadequate; `level` the p-value that does so, another
-    one where another test has a say too. The noise is estimated from fast changes, which understates coloured noise by
-    1/√(1−ρ): 3 times at a correlation of 0.9 between neighbours. Residuals beyond ten times the noise (five for an
-    angle) are not noise of any colour.
+    `FALSE_ALARM` is the probability of calling an adequate model inadequate; `level` the p-value that does so. Fast
+    changes understate coloured noise by 1/√(1−ρ): 3 times at a correlation of 0.9 between neighbours. Residuals beyond
+    ten times the noise (five for an angle) are not noise of any colour.
     """
     channels = {c: _channel(fit, c) for c in fit.problem.outputs}
     asked = [c for c in channels if c not in (idle := undecided(fit))]

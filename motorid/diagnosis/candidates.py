@@ -171,10 +171,9 @@ class Search:
             found |= {t.name: self._judge(node, t.added, later[t.name]) for t in tasks if t.name in later}
         gains = {c: evidence(node, c).gain for c, _ in found.values() if c is not None}
         most = max((gain for c, gain in gains.items() if not c.objection), default=-np.inf)
-        # What is refused may hide the simpler one of its kind: what leads, also one that lost the race.
         inside = {name: c.fit.values for c, gain in gains.items() if c.objection for e in c.fit.model.effects
-                  if e.name == c.added for name in e.includes if name not in found
-                  or (gain > most and isinstance(fits.get(name), GivenUp))}
+                  if e.name == c.added for name in e.includes if name not in found  # what is refused may hide a simpler
+                  or (gain > most and isinstance(fits.get(name), GivenUp))}  # one; what leads, one that lost the race
         again = [Task(node.fit, present + s.effect, s.effect, [{**s.starts[0], **inside[s.effect.name]}, *s.starts],
                       s.drop) for s in scores if not self.stopped and s.effect.name in inside and s.starts]
         found |= {t.name: self._judge(node, t.added, f) for t, f in zip(again, self._refits(again), strict=True)}

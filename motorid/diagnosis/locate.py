@@ -205,8 +205,7 @@ class Smoothed(NamedTuple):
 
 
 class Linear(NamedTuple):
-    """A model linearised at states x (N, nx): one step from every sample, x⁺ (N-1, nx) with its slopes A and B, and the
-    outputs (N, ny) with theirs."""
+    """A model linearised at states x (N, nx): a step from each sample, x⁺ (N-1, nx), and outputs (N, ny), by slopes."""
 
     x: Array
     x_next: Array
@@ -217,8 +216,7 @@ class Linear(NamedTuple):
 
 
 def smooth(fit: Fit, k: int, walk: Array, linear: Linear) -> Smoothed:
-    """Return the smoothed run `k`; `walk` is the step size of the random walk, V/√s and N·m/√s (0: none), `linear`
-    where every walk begins."""
+    """Return the smoothed run `k`; `walk` is the step of the random walk, V/√s and N·m/√s (0: none), from `linear`."""
     run, y = fit.problem.runs[k], fit.problem.measured[k].y
     weights = np.array([1.0 / run.sigma[c] if c in run.sigma else 0.0 for c in fit.problem.outputs])
     x = linear.x

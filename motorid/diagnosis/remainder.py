@@ -603,8 +603,7 @@ def _race(found: dict[Any, Grown], tried: Iterable[tuple[Curve, Form]], before: 
     """Put into `found` the curves, each with a form more: the first to its end, of the others those that get furthest
     with few functions (successive halving: Karnin, Koren & Somekh, ICML 2013), until one leaves nothing but noise.
 
-    Returns those that got furthest of all; none where one leaves nothing more. On `trial` all have few functions, and
-    the best goes on.
+    Returns those that got furthest of all; none where one leaves nothing more. On `trial` all have few functions.
     """
     racing = dict[Any, Iterator[Grown]]()
 

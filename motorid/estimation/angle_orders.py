@@ -1,9 +1,8 @@
 """Orders of angle-periodic effects (cogging, ripple of torque or sensor) from the model's response to every order.
 
-The answer of the outputs to sin(Nθ) and cos(Nθ) torques along the measured angle, for all N at once, projected off
-the tangent space of the fit like any other score, both without their colour (`whitening`); no signal is
-differentiated. Each order is looked for where the motion is slow enough to show it: at less than a quarter of a
-period per sample no alias and no delay of a sensor can pose as it.
+The answer of the outputs to sin(Nθ) and cos(Nθ) torques along the measured angle, for all N at once, projected off the
+tangent space of the fit like any other score, both without their colour (`whitening`). Each order is looked for where
+less than a quarter of a period passes per sample: there no alias and no delay of a sensor can pose as it.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -109,9 +108,8 @@ def strongest_order(fit: Fit, effects: Sequence[Effect]) -> tuple[Effect, dict[s
 
 
 def spectrum(tangent: Tangent, effect: Effect) -> Spectrum:
-    """Return what each order explains of the misfit. `effect` tells what is modulated: the torque itself (an amplitude
-    in N·m), or the torque made by the current or the speed as read (a relative amplitude), by a fixed parameter of it
-    the back-EMF or the angle too."""
+    """Return what each order explains of the misfit. `effect` tells what is modulated: the torque itself (N·m), or that
+    made by the current or the speed as read (relative), by a fixed parameter of it the back-EMF or the angle too."""
     if all(p.null != 0 or p.unit for p in effect.parameters):
         return _spectrum(tangent, "torque")
     both = next((p.name for p in effect.parameters if not p.vary and p.grid), None)

@@ -139,9 +139,8 @@ def _slope(law: Law, values: Mapping[str, float], name: str) -> float:
 
 
 def _laws(problem: Problem, values: Mapping[str, float]) -> dict[str, tuple[str, str, Law]]:
-    """Return unit, words and law of the combinations that the model has. Of ``ω/v = K/((L s + R)(J s + b) + K²)`` the
-    gain and the poles; every torque as the voltage R·τ/K that overcomes it; with dry friction alone the no-load
-    speed."""
+    """Return unit, words and law of the combinations that the model has: of ``ω/v = K/((L s + R)(J s + b) + K²)`` gain
+    and poles; every torque as the voltage R·τ/K that overcomes it; with dry friction alone the no-load speed."""
     model, runs, motor = problem.model, problem.experiments, problem.model.base == "dc_motor"
     volt, speed, drive = (u := runs[0].units["v"]), "m/s" if problem.linear else "rad/s", channel_name("v", u)
 

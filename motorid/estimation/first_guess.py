@@ -2,8 +2,8 @@
 
 The balances are integrated over time, so nothing is differentiated, and solved as non-negative linear least squares:
 ``∫v dt = L Δi + R ∫i dt + K ∫ω dt`` and ``K ∫i dt = J Δω + b ∫ω dt`` (Garnier & Wang, Identification of Continuous-time
-Models from Sampled Data, 2008, ch. 1). A current or a speed that was not measured is eliminated; what the record cannot
-tell is taken from the values given, or from round numbers. Torques of the model's effects are further columns.
+Models from Sampled Data, 2008, ch. 1). A current or a speed that was not measured is eliminated; what no record tells
+is taken as given, or round. Torques of the model's effects are further columns.
 """
 
 from __future__ import annotations

@@ -59,9 +59,8 @@ def least_squares(problem: Problem, effort: LevenbergMarquardt, callback: Callba
                   q: Array | None = None, refine: bool = True, rounds: int = ROUNDS) -> Estimate:
     """Minimise the cost of `problem` from the values of its model, or from `q`.
 
-    `refine` chooses the sub-steps anew where the solution goes, since those chosen far from it hide what rings between
-    samples; the run is repeated at most `rounds` times while they do not suit its end. Raises `FitError` if the model
-    cannot be simulated at the start.
+    `refine` chooses the sub-steps anew where the solution goes: those chosen far off hide what rings between samples.
+    The run is repeated at most `rounds` times while they do not suit. Raises `FitError` if the start is no model.
     """
     q, history = problem.start if q is None else q, ()
     for _ in range(rounds):

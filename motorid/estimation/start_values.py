@@ -24,9 +24,8 @@ PHASES = tuple(np.arange(4) * np.pi / 2)
 
 
 def with_start_values(problem: Problem) -> Problem:
-    """Return the problem with values that suit the data. From a first guess that takes all friction for viscous,
-    bristles or a Stribeck curve find no way; Coulomb does. So a model whose effects contain simpler ones races against
-    where the simpler model leads."""
+    """Return the problem with values that suit the data. From a guess that takes all friction for viscous, bristles or
+    a Stribeck curve find no way; Coulomb does: what contains simpler ones races against where the simpler one leads."""
     begin, simpler, inner = _guessed(problem), problem.model, _contained(problem.model)
     try:
         for effect, simple in inner.items():

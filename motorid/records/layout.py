@@ -14,6 +14,8 @@ from motorid.records.headers import Unit
 _PERCENT = re.compile(r"%|pct|per_?cent|prozent")
 _DATES = ("date", "datum", "fecha", "x_value")
 _DRIVES = re.compile("input|output|control|command|drive")  # words of a column that may well be the drive voltage
+NAMED = 9.0  # score of a column that the user named
+STEADY = 0.2  # of its largest value: a voltage that ranges less beside a duty cycle that ranges more is the supply's
 _WHOLE = 1, 100, 255, 1023, 4095, 65535  # of a duty cycle: its share, per cent, counts of a timer of 8 to 16 bits
 _MEANING = {c: f"the {name}" for c, name in NAMES.items()} | {"v": "the drive voltage"}
 Units = Mapping[str, Unit | None]
@@ -26,7 +28,7 @@ class Place:
     column: str
     unit: Unit
     stated: bool
-    score: float = 9.0
+    score: float = NAMED
     times: str | None = None
 
 
@@ -152,6 +154,9 @@ def _last_resorts(places: dict[str, Place], labels: Units, values: Mapping[str, 
         places["omega"] = Place("y", _default("omega"), False)
         notes.append("took column 'y' as the speed; if it is not, say which channel it is with columns.")
     duty, supply = [c for c in labels if headers.is_duty(c)], [c for c in labels if headers.is_supply(c)]
+    if "v" in places and places["v"].score < NAMED and len(duty) == 1 and not supply and (
+            _range(places["v"].column, values) < STEADY < _range(duty[0], values)):  # it is the supply's
+        supply = [places.pop("v").column]
     if "v" not in places and len(duty) == len(supply) == 1:
         unit, (top, whole) = headers.unit_in(duty[0])[1], _reach(duty[0], values)
         ratio = unit if unit and unit.dimension == "ratio" else Unit("ratio", 1 / whole, "1", f"1/{whole:.4g}")
@@ -160,6 +165,12 @@ def _last_resorts(places: dict[str, Place], labels: Units, values: Mapping[str, 
         places["v"] = Place(duty[0], product, True, times=supply[0])
         whole_is = "" if ratio is unit else f" (reaches {top:.4g}, of {whole:.4g})"
         notes.append(f"took '{duty[0]}'{whole_is} times '{supply[0]}' as the drive voltage.")
+
+
+def _range(column: str, values: Mapping[str, Array]) -> float:
+    """Return how far a column ranges, over its largest size."""
+    known = [y for y in values.get(column, ()) if math.isfinite(y)] or [0.0]
+    return (max(known) - min(known)) / (max(map(abs, known)) or 1)
 
 
 def _reach(duty: str, values: Mapping[str, Array]) -> tuple[float, float]:

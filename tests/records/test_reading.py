@@ -724,3 +724,16 @@ def test_a_unit_amidst_a_header_and_one_of_direct_current(tmp_path):
     two = "".join(f"{k * 1e-3:.3f},{k % 7},{k % 5},{k % 4}\n" for k in range(60))
     with pytest.raises(DataError, match="look equally like the current"):
         read_csv(write(tmp_path, "Time(s),Voltage(V),Current(mA) filtered,Current(mA) raw\n" + two))
+
+
+@pytest.mark.parametrize(("voltage", "product"), [(12.0, True), ([12.0, 11.6, 12.1, 11.9], True),
+                                                  ([6, -6, 3, 9], False)])
+def test_a_voltage_that_hardly_changes_beside_a_duty_cycle_is_the_supply(voltage, product):
+    table = pd.DataFrame({"time_s": np.arange(40) * 1e-2, "voltage": np.resize(voltage, 40),
+                          "pwm": np.resize([100, -60, 30, 0], 40), "speed": np.arange(40.0)})
+    (run,) = read_runs([table])
+    duty = table["pwm"].to_numpy() / 100
+    assert run.inputs["v"] == pytest.approx(table["voltage"].to_numpy() * (duty if product else 1))
+    assert any("took 'pwm'" in note for note in run.meta["notes"]) == product
+    (asked,) = read_runs([table], columns={"v": "voltage"})
+    assert asked.inputs["v"] == pytest.approx(table["voltage"].to_numpy())  # as the user says
