@@ -180,8 +180,8 @@ def _pursued(answers: Answers, had: Sequence[int]) -> Iterator[tuple[int, ...]]:
         norms = np.sqrt(np.where(free, np.diagonal(left), 1.0))
         taken = np.where(free, np.abs(products) / norms, 0.0)
         best = int(np.argmax(taken))
-        if not taken[best] ** 2 > 2 * np.log(len(taken)) * square / len(answers.residual):
-            return
+        if not (free[best] and taken[best] ** 2 > 2 * np.log(len(taken)) * square / len(answers.residual) > 0):
+            return  # nor where nothing is left, which rounding makes less than nothing
         unit, product = left[:, best] / norms[best], products[best] / norms[best]
         left, products, square = left - np.outer(unit, unit), products - product * unit, square - product**2
         yield (chosen := (*chosen, best))
