@@ -102,7 +102,7 @@ def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
             if fit.values[p.name] > made > 0:
                 return f"{p.name} is {number(fit.values[p.name] / made, 2)} times the largest torque of the motor"
         holds = fit.values.get("g", fit.values.get("K", 0.0) / max(fit.values.get("R", 1.0), 1e-300)) * top
-        if p.name == "tau_0" and p.vary and abs(fit.values[p.name]) > holds > 0 and far(fit):  # which drags it, else
+        if p.name[:4] == "tau_" and p.vary and abs(fit.values[p.name]) > holds > 0 and far(fit):  # which drags it, else
             share = number(abs(fit.values[p.name]) / holds, 2)
             return f"{p.name} is {share} times what the motor holds at the largest voltage"
         most = MOST_OFFSET if p.lower < 0 else MOST_LOST

@@ -445,13 +445,16 @@ def test_what_only_held_out_runs_show_is_looked_for_there(rng):
     assert "fitted, too" not in alike.text
 
 
-@pytest.mark.parametrize(("share", "refused"), [(0.9, False), (-0.9, False), (1.2, True), (-1.2, True)])
-def test_a_constant_load_is_no_more_than_the_motor_holds(monkeypatch, share, refused):
-    """Of a bridge that gives little more at twice the duty a load was "missing" that turned the motor by itself."""
-    t = np.arange(400) * 2e-3
-    model = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=4e-5, J=3e-5) + mi.effects.constant_load(tau_0=1e-3)
+@pytest.mark.parametrize(("name", "share", "refused"), [
+    ("tau_0", 0.9, False), ("tau_0", -0.9, False), ("tau_0", 1.2, True), ("tau_0", -1.2, True),
+    ("tau_cn", 0.9, False), ("tau_cn", 1.2, True)])
+def test_a_load_or_friction_is_no_more_than_the_motor_holds(monkeypatch, name, share, refused):
+    """Of a bridge that gives little more at twice the duty a load was "missing" that turned the motor by itself; of one
+    that only ran forward a friction backward of five times the largest voltage."""
+    t, effect = np.arange(400) * 2e-3, LIBRARY["constant_load" if name == "tau_0" else "coulomb_asymmetric"]
+    model = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=4e-5, J=3e-5) + effect(**{name: 1e-3})
     fit = mi.solve(mi.Problem(model, [simulated(t, np.where(t < 0.1, 0.0, 6.0), model=model)]), start="model")
-    fit = replace(fit, values=fit.values | {"tau_0": share * fit.values["K"] * 6.0 / fit.values["R"]})
-    assert "motor holds" not in objections(fit, mi.effects.constant_load)  # it is dragged, and nothing else is missing
+    fit = replace(fit, values=fit.values | {name: share * fit.values["K"] * 6.0 / fit.values["R"]})
+    assert "motor holds" not in objections(fit, effect)  # it is dragged, and nothing else is missing
     monkeypatch.setattr(admissibility, "far", lambda fit: ["omega"])
-    assert ("times what the motor holds" in objections(fit, mi.effects.constant_load)) == refused
+    assert ("times what the motor holds" in objections(fit, effect)) == refused
