@@ -190,7 +190,8 @@ def test_a_motor_that_is_another_in_every_run_lacks_a_size_of_each(lab, name, fa
 def test_parts_of_one_record_are_one_motor(lab):
     """A size of each record: what parts of one show differs with the time, not from run to run."""
     whole = of_different_motors(lab, "J", (0.8, 1.3, 1.0, 1.0))[:2]
-    parts = [run.select(cut).with_(meta=part_meta(run)) for run in whole for cut in (slice(0, 200), slice(200, None))]
+    cuts = ((run, run.select(cut)) for run in whole for cut in (slice(0, 200), slice(200, None)))
+    parts = [part.with_(meta=part_meta(run, part)) for run, part in cuts]
     both, one = (mi.fit(mi.dc_motor(), runs) for runs in (parts, parts[:2]))
     assert [s["run"][0] for s in signals_along(both)] == [0, 0, 1, 1]
     asked = {form.on for form in linearised(both).forms}

@@ -43,7 +43,8 @@ def fake_fit():
     return SimpleNamespace(
         model=model.fix("J"), values=model.values, std=std, status="stalled", message="no step is better.",
         formulation="hard", extra={"multipliers": (limit,)},
-        problem=SimpleNamespace(experiments=(run, run), n_outputs=7640), iterations=12,
+        problem=SimpleNamespace(experiments=(run, run), n_outputs=7640, penalties=(), constraints=()), iterations=12,
+        at_bound=set(),
         seconds=0.231, nrmse=nrmse, rmse=rmse, noise={"i": 0.004, "omega": 0.15},
         evaluation=SimpleNamespace(simulations=[SimpleNamespace(experiment=run)], nrmse=nrmse, rmse=rmse),
         fits="noise", verdict="Fits: errors at the level of the noise (NRMSE current 1.68 %, speed 0.815 %).",
