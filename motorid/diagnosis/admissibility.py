@@ -39,7 +39,7 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
             return f"{p.name} runs to its limit: nothing of this shape is in the records"
         if p.vary and p.null is not None and not p.positive and fit.values[p.name] <= p.lower == p.null:
             return f"{p.name} goes to {p.null:g}: the records show none of it, or only with the wrong sign"
-        values = [fit.values[p.name], *(own["value"] for own in fit.per_run.get(p.name, {}).values() if p.per_run)]
+        values = [fit.values[p.name], *(o["value"] for o in ((p.per_run and fit.per_run.get(p.name)) or {}).values())]
         for limit, sign in ((p.upper, 1), (p.lower, -1)):
             physical = np.isfinite(limit) and limit in (declared.upper, declared.lower)  # not set for these records
             if p.vary and physical and sign * limit > 0 and max(sign * v for v in values) > 0.98 * sign * limit:
