@@ -22,7 +22,6 @@ READ_BACK = 0.5  # of the noise of the angle: 0.02 on a real arm that hung from 
 RUNS_ON = 0.1  # of its highest speed: slower is near enough to a stop; and of the travel: an impact is less deep
 EMPTIED = 1e-2  # of its value before: it has vanished
 LENGTHS = ("rad", "m")  # a gap that runs to its limit is none
-DRY = ("tau_c", "tau_cp", "tau_cn", "tau_s", "tau_m")  # frictions that a motor turns against
 
 
 def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
@@ -39,7 +38,8 @@ def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
             return f"{p.name} runs to its limit: nothing of this shape is in the records"
         if p.vary and p.null is not None and not p.positive and fit.values[p.name] <= p.lower == p.null:
             return f"{p.name} goes to {p.null:g}: the records show none of it, or only with the wrong sign"
-        values = [fit.values[p.name], *(o["value"] for o in ((p.per_run and fit.per_run.get(p.name)) or {}).values())]
+        others = fit.per_run.get(p.name, {}).values() if p.per_run else ()
+        values = [fit.values[p.name], *(own["value"] for own in others)]
         for limit, sign in ((p.upper, 1), (p.lower, -1)):
             physical = np.isfinite(limit) and limit in (declared.upper, declared.lower)  # not set for these records
             if p.vary and physical and sign * limit > 0 and max(sign * v for v in values) > 0.98 * sign * limit:
@@ -102,9 +102,11 @@ def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
             if fit.values[p.name] > made > 0:
                 return f"{p.name} is {number(fit.values[p.name] / made, 2)} times the largest torque of the motor"
         holds = fit.values.get("g", fit.values.get("K", 0.0) / max(fit.values.get("R", 1.0), 1e-300)) * top
-        stalls = p.vary and holds > 0 and (p.name in DRY or (p.name == "tau_0" and far(fit)))  # a load may drag it
-        if stalls and (share := abs(fit.values[p.name]) / holds) > 1:
-            return f"{p.name} is {number(share, 2)} times what the motor holds at the largest voltage"
+        beside = {"tau_cp": "tau_cn", "tau_cn": "tau_cp"}.get(p.name)  # it turns that way; what coasts, either
+        stalls = fit.values[beside] < holds if beside else p.name == "tau_0" and far(fit)  # a load may drag it
+        if stalls and p.vary and abs(fit.values[p.name]) > holds > 0:
+            share = number(abs(fit.values[p.name]) / holds, 2)
+            return f"{p.name} is {share} times what the motor holds at the largest voltage"
         most = MOST_OFFSET if p.lower < 0 else MOST_LOST
         if p.vary and p.unit == "V" and p.null == 0 and abs(fit.values[p.name]) > most * top:
             size = f"{percent(abs(fit.values[p.name]) / top, 2)} of" if top else "more than"

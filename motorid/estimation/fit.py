@@ -173,8 +173,7 @@ def solve(problem: Problem, solver: Any = None, *, start: str = "auto", callback
 
 def check_solver(solver: Any) -> None:
     """Refuse what is no solver."""
-    if isinstance(solver, type) or not (
-            solver is None or isinstance(solver, LevenbergMarquardt) or hasattr(solver, "solve")):
+    if isinstance(solver, type) or not (isinstance(solver, LevenbergMarquardt | None) or hasattr(solver, "solve")):
         raise UsageError("solver takes mi.LevenbergMarquardt() (the default) or mi.MultipleShooting(), not a name; "
                          f"got {name_of(solver)}.")
 

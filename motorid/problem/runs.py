@@ -188,8 +188,7 @@ def _lead(run: Experiment) -> int:
 def _may_rest(run: Experiment, sigma: Mapping[str, float], lead: int) -> bool:
     """Tell whether neither current nor speed speak against rest at the first samples."""
     # With the voltage on from the first sample, a motor at rest moves at the second: there both tell at the first.
-    # A motor that comes to rest before the first voltage tells only then, too.
-    checked = min(max(lead, 1 if {"i", "omega"} <= sigma.keys() else 2), FIRST)
+    checked = min(max(lead, 1 if {"i", "omega"} <= sigma.keys() else 2), FIRST)  # later it may have come to rest
     for c in ("i", "omega"):
         if c in sigma:
             y = run.outputs[c][:checked]

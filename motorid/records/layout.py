@@ -14,7 +14,6 @@ from motorid.records.headers import Unit
 _PERCENT = re.compile(r"%|pct|per_?cent|prozent")
 _DATES = ("date", "datum", "fecha", "x_value")
 _DRIVES = re.compile("input|output|control|command|drive")  # words of a column that may well be the drive voltage
-NAMED = 9.0  # score of a column that the user named
 STEADY = 0.2  # of its largest value: a voltage that ranges less beside a duty cycle that ranges more is the supply's
 _WHOLE = 1, 100, 255, 1023, 4095, 65535  # of a duty cycle: its share, per cent, counts of a timer of 8 to 16 bits
 _MEANING = {c: f"the {name}" for c, name in NAMES.items()} | {"v": "the drive voltage"}
@@ -28,7 +27,7 @@ class Place:
     column: str
     unit: Unit
     stated: bool
-    score: float = NAMED
+    score: float = 9.0
     times: str | None = None
 
 
@@ -53,7 +52,7 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     notes: list[str] = []
     free = [c for c in labels if c not in {p.column for p in places.values()}]
     _named_by_header(places, free, row, notes, [c for c, column in (columns or {}).items() if column is None])
-    _last_resorts(places, row, values or {}, notes)
+    _last_resorts(places, row, values or {}, notes, {*(columns or {}), *units})
     _apply_units(places, labels, units, notes)
     # An angle in counts of unknown size is left out, unless it is all there is.
     for channel in (unscaled := [c for c in ("theta", "omega") if c in places and math.isnan(places[c].unit.factor)]):
@@ -146,7 +145,8 @@ def first_of_its_name(label: str, labels: Sequence[str]) -> str:
     return name if label.endswith(")") and label[len(name) + 2:-1].isdigit() and name in labels else label
 
 
-def _last_resorts(places: dict[str, Place], labels: Units, values: Mapping[str, Array], notes: list[str]) -> None:
+def _last_resorts(places: dict[str, Place], labels: Units, values: Mapping[str, Array], notes: list[str],
+                  asked: set[str]) -> None:
     timed = [c for c, unit in labels.items() if c.lower() in _DATES or (unit and unit.dimension == "time")]
     if "t" not in places and timed:
         places["t"] = Place(timed[0], labels[timed[0]] or _default("t"), labels[timed[0]] is not None, 1.0)
@@ -154,7 +154,7 @@ def _last_resorts(places: dict[str, Place], labels: Units, values: Mapping[str, 
         places["omega"] = Place("y", _default("omega"), False)
         notes.append("took column 'y' as the speed; if it is not, say which channel it is with columns.")
     duty, supply = [c for c in labels if headers.is_duty(c)], [c for c in labels if headers.is_supply(c)]
-    if "v" in places and places["v"].score < NAMED and len(duty) == 1 and not supply and (
+    if len(duty) == 1 and not supply and "v" in places and not {"v", places["v"].column} & asked and (
             _range(places["v"].column, values) < STEADY < _range(duty[0], values)):  # it is the supply's
         supply = [places.pop("v").column]
     if "v" not in places and len(duty) == len(supply) == 1:

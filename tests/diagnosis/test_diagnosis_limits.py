@@ -457,5 +457,8 @@ def test_a_load_or_friction_is_no_more_than_the_motor_holds(monkeypatch, name, s
     fit = replace(fit, values=fit.values | {name: share * fit.values["K"] * 6.0 / fit.values["R"]})
     # A load drags it, and nothing else is missing; a friction does not.
     assert ("motor holds" in objections(fit, effect)) == (refused and name != "tau_0")
+    if name == "tau_cn":  # what only coasts may rub more than that, both ways
+        coasts = replace(fit, values=fit.values | {"tau_cp": 1.1 * fit.values[name]})
+        assert "motor holds" not in objections(coasts, effect)
     monkeypatch.setattr(admissibility, "far", lambda fit: ["omega"])
     assert ("times what the motor holds" in objections(fit, effect)) == refused

@@ -737,3 +737,6 @@ def test_a_voltage_that_hardly_changes_beside_a_duty_cycle_is_the_supply(voltage
     assert any("took 'pwm'" in note for note in run.meta["notes"]) == product
     (asked,) = read_runs([table], columns={"v": "voltage"})
     assert asked.inputs["v"] == pytest.approx(table["voltage"].to_numpy())  # as the user says
+    for key in ("v", "voltage"):
+        (scaled,) = read_runs([table], units={key: "mV"})
+        assert scaled.inputs["v"] == pytest.approx(1e-3 * table["voltage"].to_numpy())
