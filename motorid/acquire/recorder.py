@@ -129,8 +129,7 @@ def _head(port: str | Link, header: Header, whole: Program, limits: tuple[float,
 
 
 def _left(whole: Program, tail: Tail) -> Program:
-    """Return what a record lacks of the whole program; UsageError if it lacks nothing. The segment that was interrupted
-    is repeated from its start, since the motor stood still meanwhile."""
+    """Return what a record lacks of a program, from the interrupted segment; UsageError if nothing."""
     left = Program(whole.segments[int(tail.meta.get("segments done", 0)):], whole.words).after(
         tail.time - float(tail.meta.get("part begins", 0)))
     if tail.meta.get("ended") == "done" or (whole.segments and not left.segments):

@@ -89,8 +89,7 @@ def _blurred(fit: Fit, added: Effect) -> str:
 
 
 def _too_large(fit: Fit, pars: Sequence[Parameter]) -> str:
-    """Say so where a voltage lost or added is of the size of what is applied, cogging or friction more than the motor
-    ever makes, or a winding hotter than any: another parameter has paid for it."""
+    """Say so where a size is more than the motor has: voltage, torque, or heat, for which others have paid."""
     top = max(float(np.abs(r.inputs["v"]).max()) for r in fit.problem.experiments)
     if any(p.unit in ("K", "K/W") for p in pars) and (rise := hottest(fit)) > HOTTEST:
         what = f"{'magnets' if pars[0].name == 'alpha_m' else 'winding'} would be {'over ' if rise > MELTS else ''}"

@@ -24,13 +24,13 @@ from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.score_test import Score, pairs_of, rank, uses_angle, with_phase_per_run, with_warm_start
 from motorid.diagnosis.thresholds import MATERIAL
 from motorid.display.numbers import listed
-from motorid.effects import LIBRARY, MEASURED, PER_RUN, get
+from motorid.effects import LIBRARY, MEASURED, OTHER, PER_RUN, get
 from motorid.errors import ModelError, otherwise
 from motorid.estimation.fit import lost, solve
 from motorid.estimation.least_squares import FAILURES, RACE
 from motorid.estimation.result import Fit
-from motorid.model.definition import Effect
-from motorid.model.model import Model
+from motorid.model.definition import Effect, Parameter
+from motorid.model.model import BASES, Model
 from motorid.numerics.parallel import check_time
 from motorid.numerics.signals import noise_level
 from motorid.records.experiment import Experiment
@@ -95,9 +95,12 @@ def _in_doubt(node: Node, children: Sequence[Node]) -> bool:
     return led is None or any(evidence(c, led).worse_there for c in sound if c is not led)
 
 
-def library(effects: Iterable[Effect | str] | None, also: Iterable[Effect] = ()) -> list[Effect]:
-    """Return the effects to try: the whole library, or those named, and the user's own."""
-    named = [*LIBRARY, *MEASURED, *PER_RUN] if effects is None else [effects] if isinstance(effects, str) else effects
+def library(effects: Iterable[Effect | str] | None, also: Iterable[Effect] = (),
+            known: Mapping[str, Parameter] | None = None) -> list[Effect]:
+    """Return the effects to try: the library and other values of what is fixed, or those named; the user's own."""
+    fixed = [e for n, e in OTHER.items() if known and n in known and known[n].value > 0 and not known[n].vary]
+    every = [*LIBRARY, *MEASURED, *PER_RUN, *fixed]
+    named = every if effects is None else [effects] if isinstance(effects, str) else effects
     chosen, others = ([get(e) if isinstance(e, str) else e for e in some] for some in (named, also))
     own = {e.name: e for e in others}  # in the place of one of the library with the same name
     return [e for e in chosen if e.name not in own] + others
@@ -129,9 +132,8 @@ class Search:
         return self._scores[node.key]
 
     def inseparable(self, node: Node) -> dict[str, tuple[str, ...]]:
-        """Return the effects that do no more than a combination of parameters of effects that `node` has. Only of a
-        model that was expanded: one with nothing but noise left has no use for them. For a combination with the motor's
-        own parameters (the gain of a sensor among them) no reader would ask."""
+        """Return the effects that do no more than a combination of parameters of effects that `node`, once expanded,
+        has; of one of the motor's own (the gain of a sensor) no reader would ask."""
         added = {p.name for e in node.fit.model.effects for p in e.parameters}
         return {s.effect.name: s.same_as for s in self._scores.get(node.key, ())
                 if s.same_as and added >= set(s.same_as)}
@@ -157,7 +159,9 @@ class Search:
         _, wider = self._takeable(present)
         little = -np.inf if lost(node.fit) else LITTLE  # far from the records slopes say little
         short = [s for s in self._shortlist(node) if s.drop > little or not any(p.vary for p in s.effect.parameters)]
-        tasks = [Task(node.fit, present + s.effect, s.effect, s.starts, s.drop) for s in short]
+        tasks = self._freed(node)
+        tasks += [Task(node.fit, present + s.effect, s.effect, s.starts, s.drop) for s in short
+                  if all(s.effect is not t.added[0] for t in tasks)]
         for e in wider:
             with contextlib.suppress(ModelError):  # beside what is there it may describe the same twice
                 tasks.append(widened(node.fit, e))
@@ -180,6 +184,19 @@ class Search:
         children = [child for child, _ in found.values() if child is not None]
         tried = sorted((candidate for _, candidate in found.values()), key=lambda c: c.gain or 0.0)
         return children, self.listed(scores, {c.effect: c for c in tried})
+
+    def _freed(self, node: Node) -> list[Task]:
+        """Return the other values of what the user fixed that a first fit with one free finds, however far away."""
+        tasks, fit, pars = [], node.fit, node.fit.model.parameters
+        for n, e in OTHER.items() if node is self.root and far(fit) else ():
+            if any(e.law == own.law for own in self.effects):
+                fresh = {p.name: p for p in BASES[fit.model.base] if p.name == n or pars[p.name].vary}
+                with contextlib.suppress(*FAILURES):
+                    problem = fit.problem.with_(model=fit.model.with_(parameters={**pars, **fresh}), noise_factors={})
+                    found = solve(problem, QUICK).values
+                    first = {**found, f"d_{n}": np.log(found[n] / fit.values[n]), n: fit.values[n]}
+                    tasks.append(Task(fit, fit.model + e, e, [first]))
+        return tasks
 
     def _restarting(self, node: Node) -> list[Task]:
         """Return the effects that explain more with a zero of the encoder, or a warmth, of every run, with that."""
@@ -296,9 +313,8 @@ class Search:
         return listed + [c for n, c in judged.items() if n not in scored]
 
     def pruned(self, node: Node, before: Node) -> Node:
-        """Return `node` without the effects that have become superfluous, and with the simplest of each kind: a later
-        effect may have taken over what made an earlier one special. What is left is still preferred to the model
-        `before`: small losses, each by chance, may add up."""
+        """Return `node` without effects that have become superfluous, with the simplest of each kind, still preferred
+        to the model `before`: small losses, each by chance, may add up."""
         for e in node.fit.problem.model.effects:
             simpler = self._simpler(node.fit.model, e)
             alone = e.name == node.added and node.parent is not None and len(node.key - node.parent.key) == 1

@@ -93,8 +93,7 @@ class Rival:
     @staticmethod
     def as_allowed(fit: Fit) -> Rival:
         """Return the rival that a fit is, an effect that its records leave open as large as they allow: as fitted it
-        may be nothing, and no experiment would show it. Of sizes on a grid, the one is taken that, all else fitted
-        anew, raises χ² most, but by `REGION`² at most."""
+        may be nothing. Of sizes on a grid the one that, all else fitted anew, raises χ² most, by `REGION`² at most."""
         problem, names = fit.problem, [p.name for p in fit.problem.unknowns.free]
         own = ([p for p in e.parameters if p.name in names] for e in fit.model.effects)
         unseen = [p for pars in own for p in pars if all(fit.std[other.name] is None for other in pars)]

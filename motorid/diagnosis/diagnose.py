@@ -23,7 +23,7 @@ from motorid.diagnosis.remainder import Remainder
 from motorid.diagnosis.results import Diagnosis, Ladder
 from motorid.diagnosis.stepwise import Climb, explored, ladder_of
 from motorid.display.numbers import listed, number
-from motorid.effects import LIBRARY
+from motorid.effects import LIBRARY, OTHER
 from motorid.errors import MotoridError, at_least, numbers_told, otherwise
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
@@ -31,6 +31,8 @@ from motorid.model.model import SHOWN, Model
 from motorid.numerics import parallel
 from motorid.records.checks import as_command, contradictions, current_limit
 from motorid.records.experiment import Experiment, repeated, units_of
+
+SETTLED = 16.0  # of an expected χ² between two models: half of it, the gain, is two of its standard deviations, √χ²
 
 
 @parallel.one_thread
@@ -73,10 +75,10 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
     >>> better = found.best
     """
     at_least(0, max_effects=max_effects, budget=budget)
-    tried = library(effects, also)
+    tried = library(effects, also, checked(fit, "diagnose").model.parameters)
     with parallel.progress("Looking for what is missing", max_effects + 1, at_most=True) as show:
         stages = Stages(max_effects, progress, show, map)
-        found, driven = explored(checked(fit, "diagnose"), validate, tried, stages, max_effects, budget)
+        found, driven = explored(fit, validate, tried, stages, max_effects, budget)
         stages.done("located what is missing")
         twice = repeated(fit.problem.experiments, [validate] if isinstance(validate, Experiment) else validate or ())
         misread = _contradicting(found, fit.problem.experiments)
@@ -140,7 +142,7 @@ def _told(found: Climb, misread: str, driven: str, validated: bool, records: Seq
         answer = words.missing_text(ladder.rungs, remaining, groups, graded, elsewhere, found.stopped)
         same = _inseparable(found, ladder.best.model)
         details = [words.moves(fit, ladder.best), words.rises_text(ladder.rungs), words.inseparable_remark(same),
-                   words.hidden_remark(found.search.hidden(last)),
+                   words.fixed_remark(rivals or (ladder.best,)), words.hidden_remark(found.search.hidden(last)),
                    words.exchanged_remark({} if found.stopped else with_lags_exchanged(ladder.best))]
         for name, shared in same.items():  # what acts through these parameters, and that one
             inside = (e.name for e in ladder.best.model.effects if {p.name for p in e.parameters} & {*shared})
@@ -203,8 +205,9 @@ def _suggestion(fits: Sequence[Fit], groups: Sequence[Sequence[str]]) -> str | N
     if best is None:
         return None
     problem, text = fits[0].problem, f"To distinguish {listed(names)}, record {best.text}."
-    if best.discrimination[best.name] < 1e-3:
+    if best.discrimination[best.name] * best.experiment.n < SETTLED:
         more = [channel_name(c) for c in SHOWN[problem.model.base] if c not in problem.outputs]
-        told = f"; measure the {' or '.join(more)} too" if more else ""
+        fixed = any(e.name in names for e in OTHER.values())  # a meter tells that
+        told = f"; measure the {' or '.join(more)} too" if more and not fixed else ""
         text = f"No voltage record of these channels within the limits would distinguish {listed(names)}{told}."
     return worded(text, units_of(problem.experiments))

@@ -344,8 +344,7 @@ def _optimised(task: Task, say: Callable[[str], None]) -> Found:
 
 
 def _judged(task: Task) -> Task:
-    """Return the task without the pairs that no fixed candidate distinguishes, if there are others. Where within its
-    uncertainty no candidate would do, the truth is as it was fitted."""
+    """Return the task without the pairs that no fixed candidate distinguishes, if there are others."""
     kept = [_shrunk(task, c) for c in _followed(task.layout, (0.0,)).values()] if task.pairs else []
     every = [task.layout.of(k[0]) for k in kept if k is not None]
     if not every:

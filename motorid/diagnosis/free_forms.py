@@ -147,8 +147,7 @@ class Span:
 
 
 def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
-    """Return the smallest and the largest value of every quantity known in all runs, and orders of a turn: the lowest,
-    the harmonics of those in the model, and what stands out of the misfit."""
+    """Return the extremes of every quantity known in all runs, and orders of a turn: low, the model's, the misfit's."""
     names = set.intersection(*(set(s) for s in signals))
     step = float(np.median(np.concatenate([np.diff(s["t"]) for s in signals])))
     ranges = {n: (min(float(s[n].min()) for s in signals), max(float(s[n].max()) for s in signals)) for n in names}
@@ -231,8 +230,7 @@ def _place(value: float, low: float, high: float, unit: str = "") -> str:
 
 
 def functions_of(form: Form, span: Span) -> list[str]:
-    """Return the functions that a form is made of, as source in its quantity z; `m.sign` is the model's smooth sgn.
-    Where they bend, set in or fade is written as a `PLACE`."""
+    """Return the functions of a form as source in its quantity z; where they bend, set in or fade is a `PLACE`."""
     low, high = span.ranges[form.on]
     if form.on == "run":
         return ["1.0"]
@@ -339,8 +337,7 @@ def waves_of(span: Span) -> list[float]:
 
 
 def _sectors(count: int, pitches: int, load: bool) -> list[str]:
-    """Return sectors and lobes of a pitch as source, one inside and zero outside: a worn segment, a tooth; of a `load`
-    also what is climbed over, against the motion and then with it: a catch, a cam."""
+    """Return sectors and lobes of a pitch as source: a worn segment, a tooth; of a `load` also a catch, a cam."""
     sectors = [(c, w / 2, w / EDGE) for k in range(SECTORS) if (w := 2**k * 2 * np.pi / count) < 2
                for c in np.arange(count) * 2 * np.pi / count]
     lobes = [(c, w, w) for w in LOBES for c in np.arange(0, 2 * np.pi, 1.5 * w)]
@@ -435,9 +432,8 @@ class Linear:
 
 def linearised(fit: Fit, only: Form | None = None, span: Span | None = None,
                zeros: Mapping[str, float] | None = None) -> Linear:
-    """Return the model of `fit` on its records, with the forms that these can show, or `only` one over a span; over a
-    turn that begins at these `zeros`, by name as in `zeros_of`. SimulationError where its answer to small changes grows
-    without bound; of all forms, when one is asked for."""
+    """Return the model of `fit` on its records with the forms that these can show, or `only` one over a span; a turn
+    begins at these `zeros` (`zeros_of`). SimulationError where its answer to small changes grows without bound."""
     problem = fit.problem
     residual, jac = _at(problem, fit)
     signals = signals_along(fit)
@@ -575,8 +571,7 @@ def zeros_of(fit: Fit, form: Form) -> dict[str, float]:
 
 
 def form_columns(fit: Fit, linear: Linear, form: Form) -> tuple[Array, Array]:
-    """Return the slopes in solver coordinates with the form's answers, and the sizes by which these were scaled: a unit
-    of each coefficient makes an answer as large as what was measured."""
+    """Return the slopes in solver coordinates with the form's answers, as large as what was measured, and how."""
     problem, n, answers = fit.problem, len(linear.residual), linear.answer(form)
     measured = [(m.y * m.weights)[:, m.weights > 0] ** 2 for m in problem.measured]
     size = np.sqrt(n) * float(np.sqrt(np.mean([np.nanmean(y2) for y2 in measured])))

@@ -169,9 +169,8 @@ def _text(where: str | None, shares: Mapping[str, float], regions: Mapping[str, 
 
 
 def accounted(before: Fit, after: Fit) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Return per run the voltage (V) and torque (N·m) missing in `before` that `after` has, by its effects and the
-    shift of the parameters: what the balances of `before` lack along the motion of `after`. A current that was not
-    measured is each model's own, and the torque stands for both balances."""
+    """Return per run the voltage (V) and torque (N·m) missing in `before` that `after` has: what the balances of
+    `before` lack along its motion. A current that was not measured is each model's own; the torque stands for both."""
     every, own = [], "i" in before.problem.system.states and "i" not in before.problem.outputs
     scale = {"i": 0.0 if own else before.values.get("L", 0.0), "omega": before.values["J"]}
     for k, run in enumerate(after.problem.runs):

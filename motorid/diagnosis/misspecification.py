@@ -47,8 +47,7 @@ class FormGain:
 
 
 def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> list[FormGain]:
-    """Return the forms that added to `fit` predict these channels, and all, better than `rival`, the best first. What
-    remembers comes after a function of the present that is not surely worse."""
+    """Return the forms that added to `fit` predict better than `rival`, the best first, memories last."""
     try:
         linear = free_forms.linearised(fit)
         answers = {form: Answers(fit, linear, form).predictions() for form in linear.forms}
@@ -165,8 +164,7 @@ def pitches_of(fit: Fit, form: Form, span: Span) -> int:
 
 
 def _pursued(answers: Answers, had: Sequence[int]) -> Iterator[tuple[int, ...]]:
-    """Yield sets of functions, each with one more: that which takes most of what is left, beside those it `had`; by
-    products alone (Rubinstein, Zibulevsky & Elad, Technion CS-2008-08)."""
+    """Yield sets of functions, each with the one more that takes most of what is left (Technion CS-2008-08)."""
     own = slice(answers.known, answers.known + answers.functions)
     known = answers.columns[:, : answers.known]
     known = np.linalg.svd(known[:, np.linalg.norm(known, axis=0) > 0], full_matrices=False)[0]
@@ -322,8 +320,7 @@ def _within_smoothing(fit: Fit, effect: Effect) -> str:
 
 
 def differs(fit: Fit, form: Form, effect: Effect) -> float | None:
-    """Return by what share of an effect, RMS, a form differs from it of which it is a special case; None if it is none.
-    A constant friction is one of a friction that changes with the angle."""
+    """Return by what share, RMS, a form differs from an effect that is a special case of it; None if it is none."""
     sizes = [p.name for p in effect.parameters if p.null == 0]
     if not sizes or not all(free_forms.contains(fit, form, [name]) for name in sizes):
         return None

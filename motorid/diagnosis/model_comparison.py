@@ -140,8 +140,7 @@ def _laws_as_good(chosen: Node, children: Sequence[Node], parent: Node) -> list[
 
 
 def _price(node: Node) -> tuple[bool, int]:
-    """What decides between equals: whether a model has a rare device in the place of dry friction (all that turns rubs,
-    and few were built to brake like an eddy current), then its size."""
+    """What decides between equals: no rare device in the place of dry friction, as all that turns rubs; then size."""
     return "eddy_brake" in node.key and not rubs(node), node.size
 
 

@@ -91,9 +91,8 @@ class Evidence:
 
     @property
     def worth_it(self) -> bool:
-        """Tell whether the new model is to be preferred: surely better, by an amount that matters, and not worse there.
-        The amount is that over all samples predicted: where held-out runs rise by as much as blocks fall by chance, it
-        is none. A rise there beyond that refuses it."""
+        """Tell whether the new model is surely better, by an amount that matters, and not worse there. That is over all
+        samples; held-out runs may rise by as much as blocks fall by chance."""
         fall = self.fall if self.everywhere is None else self.everywhere
         return self.sure and fall > thresholds.MATERIAL and not self.worse_there
 
@@ -278,9 +277,8 @@ def deciding(fit: Fit) -> Fit:
 
 
 def predictions_left_out(fit: Fit, evenly: bool = False) -> Channels | None:
-    """Return the errors of `fit` on blocks of its own records, each left out in turn; None where that cannot be told:
-    where slopes lead nowhere (cogging far from its phase) the linear prediction explodes. Initial states stay as they
-    were fitted, and so do parameters at a limit."""
+    """Return the errors of `fit` on blocks of its records, each left out in turn; None where slopes lead nowhere
+    (cogging far from its phase). Initial states, and parameters at a limit, stay as they were fitted."""
     problem, n = fit.problem, fit.problem.n_outputs
     at_start = {p.name for *_, p in problem.unknowns.initial}
     free = [j for j, p in enumerate(problem.unknown) if p.name not in at_start | fit.at_bound]
@@ -316,8 +314,7 @@ def by_channel(problem: Problem, residual: Array, blocks: Sequence[NDArray[np.in
 
 
 def held_out_errors(problem: Problem, noise: Mapping[str, float]) -> Channels:
-    """Return the errors of a problem's model on its runs, which it was not fitted to; what these have for themselves
-    (an encoder's zero) counts for each block as the others tell it."""
+    """Return the errors of a problem's model on runs not fitted; what a run has for itself, as other blocks tell."""
     problem, q = settled(problem)
     errors = errors_of(at(problem, q), noise)
     if problem.unknowns.apart:
@@ -330,8 +327,7 @@ def held_out_errors(problem: Problem, noise: Mapping[str, float]) -> Channels:
 
 def errors_of(simulations: Sequence[Simulation], noise: Mapping[str, float],
               judged: Sequence[Experiment] | None = None) -> Channels:
-    """Return the errors of `simulations` as they are, in blocks of each run; `judged` gives other measurements on the
-    same samples (a fold), `noise` is the sensor's per channel."""
+    """Return the errors of `simulations` in blocks of each run; `judged` gives other measurements there (a fold)."""
     runs = judged if judged is not None else [s.experiment for s in simulations]
     parts: dict[str, list[tuple[Array, NDArray[np.intp], Array]]] = {}
     for sim, run, block in zip(simulations, runs, blocks_of(runs), strict=True):

@@ -10,7 +10,7 @@ import numpy as np
 
 from motorid.diagnosis.model_comparison import far, size_of
 from motorid.diagnosis.predictive_score import QUICK, ROUGH
-from motorid.diagnosis.score_test import believable_start, uses_angle
+from motorid.diagnosis.score_test import uses_angle
 from motorid.diagnosis.thresholds import MATERIAL, NATS
 from motorid.errors import OutOfTime, otherwise
 from motorid.estimation.continuation import by_continuation, past_ripples, sharpened
@@ -57,9 +57,8 @@ class Raced:
 
 def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Raced | None:
     """Go a few steps from each start with `model` on the records of `fit`; None if none can be simulated. Where no
-    start can be (a friction that sticks at every turn), the values of `fit` are one: the smaller model could. What ends
-    above `fit`, where that is no optimum, begins anew at a first guess. Effects of the angle start along the measured
-    angle, which the model's own angle, still wrong, would lead astray."""
+    start can be (a friction that sticks at every turn), the values of `fit` are one: the smaller model could. Effects
+    of the angle start along the measured angle, which the model's own, still wrong, would lead astray."""
     model = _bounded(fit, model)
     poles = [pole for e in model.effects if e.name not in fit.model.effect_names for pole in exchanged_poles(model, e)]
     alive, starts = restored(fit, model), starts or ({},)
@@ -79,10 +78,6 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
     ahead = begun[: max(-(-len(begun) // HALVING), FINISHED)]
     found = begun if first is RACE else [(_race(done.onward, RACE) or done, along) for done, along in ahead]
     best, along = min(found, key=lambda entry: entry[0].cost, default=(None, False))
-    open_ = fit.status != "converged" and not lost(fit)
-    if best and open_ and best.cost > HARDLY * fit.cost:  # it does all that the smaller model does, and went astray
-        anew = (_begun(fit, models, start, along, RACE) for start in _guessed_starts(model, fit, starts))
-        best = min([best, *(done for done in anew if done is not None)], key=lambda done: done.cost)
     return best and Raced(best.onward, float(best.cost), _undamped(best.solution.residual, best.solution.jac), along)
 
 
@@ -158,14 +153,10 @@ def copies_the_angle(problem: Problem, q: Array) -> bool:
 def _own_starts(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> list[dict[str, float]]:
     """Return `starts` with the larger model's own first guess, where the smaller one's fit is no place to begin (an arm
     without its weight is fitted by a motor that hardly moves): the best alone where only the current is far off."""
-    return _guessed_starts(model, fit, starts if lost(fit) else starts[:1]) if largest(fit.nrmse) > LOST else []
-
-
-def _guessed_starts(model: Model, fit: Fit, starts: Sequence[Mapping[str, float]]) -> list[dict[str, float]]:
-    """Return `starts` with a model's own first guess; none where that fails."""
-    with contextlib.suppress(*FAILURES):
-        guess = first_guess(model, fit.problem.experiments, loaded=True)
-        return [{**start, **guess} for start in starts]
+    if largest(fit.nrmse) > LOST:
+        with contextlib.suppress(*FAILURES):
+            guess = first_guess(model, fit.problem.experiments, loaded=True)
+            return [{**start, **guess} for start in (starts if lost(fit) else starts[:1])]
     return []
 
 
@@ -173,7 +164,7 @@ def _started(fit: Fit, model: Model, start: Mapping[str, float], angular: bool) 
     """Return the problem of a refit, at its start."""
     own = {n: max(v, 1e-12) if model.parameters[n].positive else v for n, v in start.items() if n in model.parameters}
     problem = fit.problem.for_model(model.start_at(own)).tuned(accuracy=ROUGH)
-    apart = {**{n: v for n, v in start.items() if n not in model.parameters}, **believable_start(fit)}
+    apart = {**{n: v for n, v in start.items() if n not in model.parameters}, **fit.initial}
     problem = problem.begun_at(problem.scaling.scaled([apart.get(p.name, p.value) for p in problem.unknown]))
     return problem.for_model(replace(problem.model, angle_input=True, _systems={})) if angular else problem
 
@@ -267,7 +258,6 @@ LITTLE = 1 - (1 - MATERIAL) ** 2  # of the squared misfit; of 361 refits that pr
 FINISHED = 2  # models of a race at least: slopes and a few steps do not tell the best two apart
 OUTDONE = 1.5  # times the least cost of a race: 20 nats away from a tie at 100 effective samples
 BEHIND = 10.0  # times the cost of a model that explains all but noise
-HARDLY = 1.01  # times: near enough that a slope tells what more would do
 FAR_LESS = 0.3  # of the promise that was kept
 STOPPED = OUT_OF_TIME, INTERRUPTED = "the time is up", "interrupted"
 LESS = "rejected: far behind others after the first steps of a refit"

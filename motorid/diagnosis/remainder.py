@@ -292,8 +292,7 @@ class Curve:
         return free_forms.signals_along(self.fit)
 
     def grown(self) -> Curve | None:
-        """Return the curve with the functions of its last part that by their slopes predict more, fitted with the
-        model; one at a time, if their places move. None for none. Raises what a fit raises."""
+        """Return the curve with functions of its last part that predict more, fitted, or None; raises as a fit."""
         last, (*before, part) = self.fitted or self.fit, self.parts
         if part.by_run and part.chosen:
             return None
@@ -626,8 +625,7 @@ def _race(found: dict[Any, Grown], tried: Iterable[tuple[Curve, Form]], before: 
 
 
 def alone_predicting_more(last: Node, root: Fit, held: HeldOut, forms: Sequence[Form]) -> FormGain | None:
-    """Return the form that grew in short windows and in the place of all that `last` has and `root` has not predicts
-    better; None for none. Raises OutOfTime."""
+    """Return the form that, grown in short windows, predicts better than all that `last` has and `root` has not."""
     found = dict[Any, Grown]()
     check_time()
     with contextlib.suppress(*FAILURES):
@@ -651,8 +649,7 @@ def beside_leaving_noise(last: Node, form: Form, special: Mapping[str, float], h
 
 
 def _instead(fit: Fit, smaller: Fit, form: Form, names: Container[str]) -> Curve | None:
-    """Return a curve of few functions beside a `smaller` fit without effects of these names, which begins as what they
-    do along the fit; None where it cannot."""
+    """Return a few functions beside a `smaller` fit, begun as what effects of these names do along `fit`, or None."""
     effects = [e for e in fit.model.effects if e.name in names and not tells_the_zero(e)]
     known = [p.name for e in effects for p in e.parameters if p.null == 0]
     if not known or form.carrier == "acceleration" or not free_forms.contains(fit, form, known):

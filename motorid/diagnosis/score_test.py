@@ -65,9 +65,8 @@ class Tried(NamedTuple):
 
 
 def rank(fit: Fit, effects: Sequence[Effect], known: Sequence[Score] = ()) -> list[Score]:
-    """Score `effects` on `fit`, best first; effects that the model cannot take are left out. `known`: scores of the
-    same effects on a smaller model's fit to the same records. Where `fit` leaves hardly more than noise, what they
-    added there tells which add nothing here."""
+    """Score `effects` on `fit`, best first; those that the model cannot take are left out. `known` are scores on a
+    smaller model's fit to the same records: near the noise they tell what adds nothing here."""
     tangent = Tangent.of(fit)
     before = {s.effect.name: s for s in known}
     scores = []
@@ -230,9 +229,8 @@ NUDGE = 1e-9  # of the natural size: where sizes start, so that fmax(tau_s - tau
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """What an effect adds at one shape of it, to the whitened outputs of a fit: columns (n, k), the slopes to each of
-    `sizes`, those at a quarter of a period later after them if there is a `phase`; or the one change that the effect as
-    it is makes, where there are no `sizes`."""
+    """What an effect adds at one shape to the whitened outputs of a fit: columns (n, k), the slopes to each of `sizes`,
+    then those a quarter of a period later if there is a `phase`; without `sizes` the one change that it makes."""
 
     values: Mapping[str, float]  # of parameters that are no sizes
     columns: Array
@@ -253,17 +251,6 @@ class Shape:
         rows = [m.stack(np.broadcast_to(np.divide(m.weights, old, out=np.zeros_like(old), where=old > 0), m.y.shape))
                 for m, old in zip(fit.problem.measured, self.weights, strict=True)]
         return replace(self, columns=self.columns * np.concatenate(rows)[:, None], weights=new)
-
-
-def believable_start(fit: Fit) -> dict[str, float]:
-    """Return the estimated initial states of a fit, no current larger than twice the voltage drives through R: with
-    next to no inductance megamperes are but a kick at the start, and would melt a winding that heats."""
-    found = dict(fit.initial)
-    for k, run in enumerate(fit.problem.experiments) if "R" in fit.values else ():
-        if (name := f"i_0[{k}]") in found and "i" not in run.outputs:
-            most = 2 * float(np.abs(run.inputs["v"]).max()) / fit.values["R"]
-            found[name] = float(np.clip(found[name], -most, most))
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,7 +317,7 @@ class Added:
     @cached_property
     def _point(self) -> Point:
         """The fit's values and initial states."""
-        problem, initial = self._problem, believable_start(self.fit)
+        problem, initial = self._problem, self.fit.initial
         return problem.unknowns.point(problem.scaling.scaled([initial.get(p.name, p.value) for p in problem.unknown]))
 
     def _at(self, values: Mapping[str, float]) -> Point:

@@ -275,8 +275,7 @@ class Records:
         return Records(after, held_out, (*self.remarks, reading.remark(self.fit, after)), reading)
 
     def suited(self, node: Node) -> tuple[Fit | None, bool]:
-        """Return the model of `node`, fitted to other readings, fitted to these records, and whether it predicts these
-        better: an effect that was missing may have asked for another reading."""
+        """Return the model of `node` fitted to these records, and whether that predicts these better."""
         with contextlib.suppress(*FAILURES):
             if len(node.fit.model.effects) != len(self.fit.model.effects):
                 problem = self.fit.problem.with_(model=node.fit.model, noise_factors={})
@@ -404,8 +403,7 @@ def _remembers(found: Climb, whole: Fit, held_out: Sequence[Experiment] | None) 
 
 
 def _seen_on_whole(found: Climb, whole: Fit) -> Climb:
-    """Return a climb that knows what predicts on whole records what is larger than the noise and nothing predicts in
-    parts of them: a sensor's zero that drifts."""
+    """Return a climb that knows what predicts more than noise on whole records only: a sensor's zero that drifts."""
     runs = versions.whole_of(last := found.path[-1].fit, whole.problem.experiments)
     if not (runs and found.remaining.adequate and far(last)):
         return found

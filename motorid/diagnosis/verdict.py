@@ -13,7 +13,8 @@ from motorid.diagnosis.model_comparison import Node, far, rarity, share_removed
 from motorid.diagnosis.results import Adequacy, Candidate, Rung
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL, MOST, TRIFLE, UNCONTESTED
-from motorid.display.numbers import arrow, counted, factor, listed, percent, with_error
+from motorid.display.numbers import arrow, counted, factor, listed, percent, quantity, with_error
+from motorid.effects import OTHER
 from motorid.estimation.covariance import UNDETERMINED
 from motorid.estimation.result import Fit, parameter_cell
 from motorid.model.model import SHOWN
@@ -277,6 +278,17 @@ def unseen_remark(same: Mapping[str, tuple[str, ...]], base: str) -> str:
             ) if same else ""
 
 
+def fixed_remark(fits: Sequence[Fit]) -> str:
+    """Say what parameters that the user fixed at a value would rather be, each by the first of `fits` that tells."""
+    words = []
+    for n, effect in OTHER.items():
+        if fit := next((f for f in fits if effect.name in f.model.effect_names), None):
+            p, sd = fit.model.parameters[n], fit.std.get(f"d_{n}")
+            better = with_error(value := p.value * np.exp(fit.values[f"d_{n}"]), sd and sd * value, p.unit)
+            words.append(f"{n}, fixed at {quantity(p.value, p.unit)}, may be {better}: model.free('{n}') estimates it.")
+    return " ".join(words)
+
+
 def hidden_remark(hidden: Mapping[tuple[str, str], tuple[str, ...]]) -> str:
     """Say which wider effects than those found do the same with other values of parameters, and what would tell."""
     return " ".join(f"'{wider}' with other values of {listed(parameters)} does the same as '{name}'. To distinguish "
@@ -320,8 +332,7 @@ def closed_loop_remark(fit: Fit) -> str:
 
 
 def _noise_feedback(v, y) -> float:
-    """Correlation of the fast changes of the voltage with those of the measurement just before. None where the voltage
-    tells its own next value, as a sweep of sines does: that passes on no noise."""
+    """Correlation of fast changes of the voltage and the last measurement; None where it tells its own next."""
     if y is None or np.ptp(v) == 0:
         return 0.0
     dv, dy = np.diff(v, 2), np.diff(np.nan_to_num(y), 2)

@@ -168,8 +168,7 @@ class _OrderSearch:
     slow: Array
 
     def shares(self, lowest: int, kind: str) -> tuple[Array, list[Line]]:
-        """Return about what each order explains, and exactly the lines of those that explain most. How much the outputs
-        answer is worked out for a few orders; between them it follows what is put in."""
+        """Return about what each order explains, and exactly the lines of those that explain most."""
         orders = self.orders[lowest - 1 :]
         few = np.unique(np.geomspace(1, len(orders), SAMPLED).round().astype(int) - 1)
         lines, sizes = self.exact(orders[few], kind)
@@ -252,8 +251,7 @@ class _OrderSearch:
         return np.einsum("nxd,dn->nx", self.answers[k].b, self._forces(k, kind))
 
     def _read(self, k: int, kind: str, waves: Array, orders: Array) -> Array:
-        """Return what `waves` (N, m) of `orders` (m,) in a sensor put into the channels, (N, ny, m), in units of noise.
-        The angle of an encoder shows their integral, from what it shows at first."""
+        """Return what `waves` (N, m) of `orders` (m,) in a sensor put into the channels, (N, ny, m), over noise."""
         outputs, weights = self.fit.problem.outputs, self.fit.problem.measured[k].weights
         put = {"omega": waves * self.answers[k].states["omega"][:, None]}
         put |= {"theta": (waves - waves[0]) / (1j * orders)} if kind == "encoder" else {}

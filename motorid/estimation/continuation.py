@@ -77,8 +77,7 @@ def past_ripples(found: Estimate, effort: LevenbergMarquardt, callback: Callback
 
 
 def sharpened(found: Estimate, effort: LevenbergMarquardt, callback: Callback = None) -> Estimate:
-    """Return the estimate with a narrower sgn, as long as that lowers the cost. Where it does not, the creep of a stuck
-    motor does not matter, and a sgn so narrow only makes the model stiff."""
+    """Return the estimate with a narrower sgn as long as that lowers the cost: more only makes the model stiff."""
     while (narrower := _narrower(found)) is not None:
         width, surely = narrower
         problem = found.problem.start_at(found.values).tuned(width=width)
@@ -121,8 +120,7 @@ def _narrowest(problem: Problem, noise: float = 1.0) -> float:
 
 
 def _narrower(found: Estimate) -> tuple[float, bool] | None:
-    """Return a narrower width to try, and whether the creep of a loaded, stuck motor in the angle surely asks for it.
-    None where there is no room: narrower than what a sub-step gains in speed."""
+    """Return a narrower width to try, or None, and whether the creep of a stuck motor surely asks for it."""
     problem = found.problem
     if problem.width is None or not smooths(problem) or problem.width > 1.01 * _widths(problem)[-1]:
         return None

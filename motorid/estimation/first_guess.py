@@ -29,9 +29,8 @@ FASTEST = 0.2  # samples, L/R at least: of a current alone, from below the induc
 
 def first_guess(model: Model, runs: Sequence[Experiment], *, loaded: bool = False,
                 back_emf: float = BACK_EMF) -> dict[str, float]:
-    """Return values of the base parameters, SI, that suit `runs`, given and fixed ones as they are; if `loaded` the
-    sizes of the model's torque effects as well. `back_emf` is the share of the voltage per speed that is taken for
-    back-EMF where no current distinguishes it from viscous friction."""
+    """Return base parameters, SI, that suit `runs`, given and fixed ones as they are; if `loaded` sizes of torque
+    effects too. `back_emf` is its share of the voltage per speed where no current tells it from viscous friction."""
     held = {n: p.value for n, p in model.parameters.items() if p.given or not p.vary}
     signals = [_signals(_read_plainly(r, model), loaded) for r in runs]
     loads = _Loads(model, loads_of(model) if loaded else ())
@@ -90,8 +89,7 @@ def _solve(rows: list[tuple[Array, Array]], names: Sequence[str | Load], held: M
 
 
 def _nonnegative(a: Array, b: Array, signed: NDArray[np.bool_]) -> Array:
-    """Return the z (n,) of least ‖a z − b‖ of which only the `signed` may be negative. Zeros are tried, the fewest
-    first, until none would rather be positive. To import SciPy's `nnls` takes longer."""
+    """Return the z (n,) of least ‖a z − b‖ of which only the `signed` may be negative (`nnls` imports slowly)."""
     bound = np.flatnonzero(~signed)
     for zero in (list(c) for k in range(len(bound) + 1) for c in combinations(bound, k)):
         z, rest = np.zeros(len(signed)), np.delete(np.arange(len(signed)), zero)

@@ -372,8 +372,7 @@ def leaves_noise(fit: Fit) -> bool:
 
 
 def growth(fit: Fit) -> float:
-    """Return how many times a small error in the state, each in its RMS, grows at most along the records: in short
-    windows, along what was measured, where the model might be elsewhere without them."""
+    """Return how many times a small error in the state, each in its RMS, grows at most along the records."""
     runs, model = fit.problem.experiments, fit.model.with_(angle_input=False)
     longest = max(r.duration for r in runs)
     parts = [windows(r, longest / max(WINDOWS)) if fit.window is None and r.n > FEWEST * max(WINDOWS) else [r]

@@ -101,8 +101,7 @@ def _along_measured_angle(problem: Problem, asked: Model) -> Problem:
 
 
 def _shaped(problem: Problem, asked: Model) -> Problem:
-    """Return the problem started at the best of the shapes of each effect in turn. Phases and resonances have side
-    valleys; least squares finds knees, lags and heat capacities by itself."""
+    """Return the problem started at the best shapes of each effect in turn: phases and resonances have side valleys."""
     for effect in problem.model.effects:
         sizes, axes = natural_sizes(problem.experiments, problem.model.values), {}
         for p in _untouched(asked, effect):

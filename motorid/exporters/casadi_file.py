@@ -12,7 +12,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from motorid.channels import CHANNELS
 from motorid.errors import UsageError
 from motorid.estimation.result import Fit
 from motorid.exporters.json_file import fit_dict
@@ -55,8 +54,7 @@ def values_of(found: Fit | Model, system: System) -> Array:
 
 
 def description(found: Fit | Model) -> dict[str, Any]:
-    """Return all that is known of the model as plain data: the contents of ``fit --json``, and what it takes to
-    build it again: limits, covariance, fingerprints of the records, versions."""
+    """Return all that is known of the model as plain data: ``fit --json``, and what builds it again."""
     model, version = model_of(found), package_version("motorid")
     if isinstance(found, Fit):
         covariance = {"unknowns": [p.name for p in found.problem.unknown], "matrix": found.covariance.tolist()}
@@ -189,9 +187,8 @@ def runs_of(problem: Problem, q: Array) -> list[tuple[Run, Array, Array]]:
         # Another engine chose its own steps: take those that suit ours.
         problem = replace(problem, engine="rosenbrock").refined(q)
     point = problem.unknowns.point(q)
-    known = dict(zip([p.name for p in problem.unknown], point.physical.tolist(), strict=True))
-    return [(run, np.array([known.get(f"{c}_0[{k}]", s) for c, s in zip(CHANNELS, run.start, strict=True)]),
-             problem.unknowns.of_run(point, k).p) for k, run in enumerate(problem.runs)]
+    return [(run, problem.unknowns.sensed(point, k), problem.unknowns.of_run(point, k).p)
+            for k, run in enumerate(problem.runs)]
 
 
 def simulation(name: str, functions: Mapping[str, ca.Function], t: Array, m: NDArray[np.int64],

@@ -106,8 +106,7 @@ def mark_of(key: str, kind: str = "step") -> str | None:
 
 
 def find(mark: str) -> Path | None:
-    """Return the library called `mark` in the cache, if it is there and whole. It is alone in its folder, where no
-    other is looked at; its name is a digest, as half a file would end the process."""
+    """Return the library called `mark` in the cache, if it is there and, by its name, a digest, whole."""
     for path in (folder / mark).glob("*.so") if (folder := cache_dir()) else ():
         with suppress(OSError):
             if path.stem == _digest(path.read_bytes()):

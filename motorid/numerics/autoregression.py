@@ -147,8 +147,7 @@ def _worth(n: int, gamma: Array) -> float:
 
 
 def _levinson(gamma: Array) -> Iterator[tuple[Array, float]]:
-    """Yield coefficients and innovation variance of the Yule-Walker models of order 0, 1, … (Levinson's recursion). It
-    ends with the lags, or where nothing is left to predict."""
+    """Yield coefficients and innovation variance of the Yule-Walker models of order 0, 1, … (Levinson's recursion)."""
     a, variance = np.zeros(0), float(gamma[0])
     yield a, variance
     for k in range(1, len(gamma)):

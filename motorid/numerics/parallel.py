@@ -166,8 +166,7 @@ def processes(jobs: int) -> Iterator[Map | None]:
 
 @dataclass(frozen=True)
 class Parcel:
-    """An object pickled once; a process that gets it many times unpacks it once. A model whose law was written in a
-    notebook travels as its CasADi functions, since `Problem` carries them."""
+    """An object pickled once, unpacked once per process; a notebook's law travels as CasADi functions."""
 
     key: str
     data: bytes = field(compare=False, repr=False)

@@ -30,7 +30,7 @@ def model_dict(model: Model) -> dict[str, Any]:
     """Return what a model is made of; effects that are not in the library by where they were defined."""
     own = {e.name: {"balance": e.balance, "parameters": [p.name for p in e.parameters],
                     "defined_in": getattr(e.law, "__module__", None), "doc": e.doc}
-           for e in model.effects if e.name not in EVERY or EVERY[e.name].law is not e.law}
+           for e in model.effects if e.name not in EVERY or EVERY[e.name].law != e.law}
     return {"base": model.base, "axis": model.axis, "effects": list(model.effect_names),
             "angle_input": model.angle_input, "own_effects": own}
 

@@ -413,8 +413,7 @@ class Measured(NamedTuple):
         return full.reshape(*self.y.shape, *rows.shape[1:])
 
     def tolerance(self, traj: Trajectory, slack: float) -> tuple[float, float, Array | None]:
-        """Return the error of an interval allowed, relative to the largest state; see `Engine.prepare`. An angle, where
-        errors of all intervals add up, asks of other states what it shows of them."""
+        """Return the error of an interval allowed, relative to the largest state: of an angle errors of all add up."""
         loosest = slack * LOOSEST
         if NOISE_SHARE * (self.noise / self.top).min() >= LOOSEST:
             return loosest, loosest, None

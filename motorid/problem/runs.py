@@ -245,8 +245,7 @@ def _reach(y: Array, sigma: float) -> float:
 
 
 def _first_speed(theta: Array, t: Array, sigma: float) -> tuple[float, float]:
-    """Return the first speed and its reach, over the shortest window that noise leaves useful, whose mean speed is that
-    of its middle; a motor started at the first sample is still at rest there."""
+    """Return the first speed and its reach, over the shortest window that noise leaves useful."""
     good = np.isfinite(theta)
     y, s = theta[good], t[good]
     if len(y) < 4:

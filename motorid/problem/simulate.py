@@ -85,8 +85,7 @@ class Evaluation(Shown):
 
 def error_table(evaluations: Mapping[str, Evaluation | None], noise: Mapping[str, float] = MappingProxyType({})
                 ) -> Table:
-    """Return RMSE and NRMSE per channel of each evaluation but None, under its name (``held-out``), side by side; the
-    `noise` of the sensors, SI, is a column of its own where it is given."""
+    """Return RMSE and NRMSE per channel of evaluations, by name, side by side, with the `noise` of sensors, SI."""
     shown = {name: e for name, e in evaluations.items() if e is not None}
     units = units_of(s.experiment for e in shown.values() for s in e.simulations)
     header = ["channel", *(f"{name} {what}".strip() for name in shown for what in ("RMSE", "NRMSE"))]
@@ -332,9 +331,8 @@ def integration_error(problem: Problem, q: Array) -> float:
 
 
 def integration_bias(problem: Problem, q: Array, jac: Array) -> tuple[float, float]:
-    """Return the integration error, and by how many deviations it moves the estimate at most, in any direction. Half
-    the steps change the residual by Δr, and so the estimate by −(JᵀJ)⁻¹JᵀΔr, whose length in the metric of the
-    covariance is that of the part of Δr that J can express."""
+    """Return the integration error, and by how many deviations it moves the estimate at most. Half the steps change the
+    residual by Δr, the estimate by −(JᵀJ)⁻¹JᵀΔr: as long, in the covariance's metric, as what of Δr J can express."""
     error, change = _halved_steps(problem, q)
     jac = jac[:len(change)]
     pull = jac.T @ change

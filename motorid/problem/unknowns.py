@@ -58,13 +58,18 @@ class Unknowns:
 
     @cached_property
     def initial(self) -> tuple[tuple[str, int, Parameter], ...]:
-        """(channel, run, parameter) of each estimated initial state."""
+        """(channel, run, parameter) of each estimated initial state; of a current that was not measured how far it is
+        from steady, as a voltage through R: whatever R and L, no kick at the start that no motor gives."""
         found = []
         free = {c for c, stored in zip(self.system.states, self.system.stored, strict=True) if stored}
+        given = np.concatenate([run.experiment.inputs["v"] for run in self.runs])
+        volts = float(np.ptp(given) or np.abs(given).max()) or np.inf  # no step of the voltage is larger
         for k, run in enumerate(self.runs):
             for c, (low, high) in run.limits.items():
                 if c in free:  # an algebraic current follows from the rest
                     unit = run.experiment.units.get(c, UNITS[c][0])
+                    if c == "i" and c not in run.experiment.outputs:
+                        unit, low, high = "V", -volts, volts
                     if any(p.null == 0 and p.unit == unit for p in self.parameters.values()):
                         low, high = min(low, 0.0), max(high, 0.0)  # what was measured there may be the sensor's offset
                     found.append((c, k, Parameter(f"{c}_0[{k}]", float(run.start[CHANNELS.index(c)]), unit, low, high)))
@@ -142,11 +147,19 @@ class Unknowns:
 
     def first_state(self, at: Point, k: int) -> Array:
         """Return x0 (nx,) of run `k`."""
-        return self.system.first_state(self._sensed(at, k), at.p)
+        return self.system.first_state(self.sensed(at, k), at.p)
 
     def first_slopes(self, at: Point, k: int, along: Array | None = None) -> Array:
         """Return dx0/dq (nx, nq) of run `k`, or the slopes (nx, m) along other directions of p (np, m)."""
-        js, jp = self.system.first_slopes(self._sensed(at, k), at.p)
+        sensed = self.sensed(at, k)
+        js, jp = self.system.first_slopes(sensed, at.p)
+        if self._settling(k):
+            R, K = (self.system.parameters.index(n) for n in "RK")
+            js, jp = js.copy(), jp.copy()
+            js[:, 0] /= at.p[R]
+            jp[:, R] -= js[:, 0] * sensed[0]
+            jp[:, K] -= js[:, 0] * sensed[1]
+            js[:, 1] -= js[:, 0] * at.p[K]
         if along is not None:
             return jp @ along
         rows, columns = self._places[k]
@@ -154,11 +167,19 @@ class Unknowns:
         dx0[:, columns] += js[:, rows] * at.slope[columns]
         return dx0
 
-    def _sensed(self, at: Point, k: int) -> Array:
+    def sensed(self, at: Point, k: int) -> Array:
+        """Return (i, omega, theta) of run `k` at its start, as a sensor shows them, (3,)."""
         rows, columns = self._places[k]
         start = self.runs[k].start.copy()
         start[rows] = at.physical[columns]
+        if self._settling(k):
+            R, K = (at.p[self.system.parameters.index(n)] for n in "RK")
+            start[0] = (self.runs[k].experiment.inputs["v"][0] - K * start[1] + start[0]) / R
         return start
+
+    def _settling(self, k: int) -> bool:
+        """Tell whether the first current of run `k` is unknown, as how far it still is from its steady value."""
+        return 0 in self._places[k][0] and "i" not in self.runs[k].experiment.outputs
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,8 +29,7 @@ Element = tuple[int, bytes]
 
 
 def mat_table(data: bytes) -> TextTable:
-    """Read the numeric arrays of one length from the bytes of a MATLAB file (up to version 7). Fields of structures and
-    columns of matrices become columns; of several lengths the most frequent is taken."""
+    """Read the numeric arrays of the most frequent length from a MATLAB file; columns of matrices, too."""
     if data.startswith(b"\x89HDF") or b"MATLAB 7.3" in data[:128]:
         raise DataError("it is a MATLAB 7.3 file; save it with save(..., '-v7'), or export CSV.")
     _check_whole(data)
@@ -54,8 +53,7 @@ def mat_table(data: bytes) -> TextTable:
 
 
 def _check_whole(data: bytes) -> None:
-    """Walk through the bytes of a version 5 file and see whether sizes and types agree. SciPy trusts them: a damaged
-    size can end the process, or take all memory, instead of raising an error."""
+    """See whether sizes and types of a version 5 file agree: SciPy trusts them, up to the end of the process."""
     if (order := {b"IM": "<", b"MI": ">"}.get(data[126:128])) is None:
         return  # version 4 or no MATLAB file at all: SciPy says so without harm
     left = MOST_UNPACKED

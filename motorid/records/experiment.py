@@ -247,8 +247,7 @@ def units_of(runs: Iterable[Experiment]) -> dict[str, str]:
 
 
 def split(experiment: Experiment, n: int = 2) -> list[Experiment]:
-    """Cut a run into `n` contiguous blocks of about equal length, each with its time, e.g. to hold one out: of random
-    samples, neighbours would tell nearly the same."""
+    """Cut a run into `n` contiguous blocks of about equal length: neighbours of single samples tell nearly the same."""
     if int(n) != n or n < 1:
         raise UsageError(f"split() takes a whole number of blocks of at least 1; got {n!r}.")
     edges = np.linspace(0, experiment.n, int(n) + 1).round().astype(int)
@@ -306,8 +305,7 @@ def parts_of(run: Experiment) -> list[slice]:
 
 
 def between_pauses(run: Experiment) -> list[Experiment]:
-    """Return the parts of a run as runs of their own, since nobody saw what the motor did meanwhile. Where the clock
-    starts again so does a record, and with it what is another in every run."""
+    """Return the parts of a run as runs of their own; where the clock starts again so does a record."""
     if (parts := parts_of(run)) == [slice(0, run.n)]:
         return [run]
     whole, notes = record_of(run), [run.meta.get("notes", ()), *[()] * len(parts)]  # told once

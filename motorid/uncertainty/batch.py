@@ -247,8 +247,7 @@ def motors_in(folder: str | Path) -> dict[str, list[Path]]:
 
 
 def outliers(rows: Sequence[Mapping[str, Any]], names: Sequence[str], positive: frozenset[str]) -> tuple[Outlier, ...]:
-    """Return the outliers of a batch, the most extreme first. `rows` have ``motor`` and per parameter in `names` its
-    value and ``<name>_std``; those in `positive` are compared on the logarithmic scale."""
+    """Return outliers of a batch, the most extreme first: ``motor``, `names` and ``<name>_std`` per row."""
     found = []
     for n in names:
         known = [r for r in rows if r.get(f"{n}_std") is not None]

@@ -236,8 +236,7 @@ def _structural_rank(problem: Problem, q: Array, points: int, seed: int) -> int:
 
 
 def basis_in_words(names: Sequence[str], weak: Array, matrix: Array) -> tuple[WeakDirection, ...]:
-    """Return the weak directions with as few parts as possible, and what a step of 10 % along each does. `weak` (d, k)
-    has orthonormal rows, `matrix` (n, k) the whitened outputs per relative change."""
+    """Return weak directions (d, k) with as few parts as possible, and what a step of 10 % along each does."""
     found = []
     for row in sparse_basis(weak):
         row = row / row[np.argmax(np.abs(row))]

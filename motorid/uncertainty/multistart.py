@@ -207,8 +207,7 @@ class Multistart(Printed):
 
     @property
     def elsewhere(self) -> str:
-        """Where the others ended: ``2 at b = 1.3·10⁻³ N·m·s/rad (3.1 times the squared error)``; else empty. The places
-        with most fits, and there the parameters that are farthest off."""
+        """Where most others ended: ``2 at b = 1.3·10⁻³ N·m·s/rad (3.1 times the squared error)``; else empty."""
         best, pars = self._lowest.values, self.reference.model.parameters
         places = sorted(self._places("poor"), key=len, reverse=True)
         told = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 from battery.cases import ANGLE, Case
@@ -55,6 +57,36 @@ def test_of_an_angle_that_went_one_way_no_friction_of_two_directions_is_kept():
     found = mi.diagnose(mi.fit(mi.dc_motor(), [run]))
     assert found.effects == ("coulomb",)
     assert found.remaining.adequate
+
+
+@pytest.mark.parametrize(("name", "factor"), [("R", 0.7), ("R", 1000.0), ("L", 1000.0), ("K", 0.1), ("J", 1000.0),
+                                              ("J", 1e-3), ("b", 5.0)])
+def test_a_value_that_was_fixed_wrong_is_told_before_a_sensor_is_blamed(lab, name, factor):
+    """By a data sheet of another motor, a meter, or a unit: a current sensor 30 % off was "missing", or a filter."""
+    runs, check = Case("plain", "none", "lab", {}, n=700).records()
+    true = getattr(lab, name)
+    found = mi.diagnose(mi.fit(mi.dc_motor().fix(**{name: factor * true}), runs), check)
+    assert f"other_{name}" in {*found.effects, *(n for group in found.groups for n in group)}, found.text
+    assert f"{name}, fixed at" in found.text
+    assert found.text.endswith(f"model.free('{name}') estimates it.") or "would distinguish" in found.text
+    assert "measure the" not in found.text
+    assert found.remaining.adequate
+    freed = next(f for f in found.rivals if f"other_{name}" in f.model.effect_names)
+    assert freed.values[name] * np.exp(freed.values[f"d_{name}"]) == pytest.approx(true, rel=0.05)
+
+
+def test_a_value_that_was_fixed_right_is_not_doubted_and_another_can_be_asked_for(lab, tmp_path):
+    runs, check = Case("rubs", "single", "lab", {"coulomb": {"tau_c": 8e-3}}, n=700).records()
+    found = mi.diagnose(mi.fit(mi.dc_motor().fix(R=lab.R, J=lab.J), runs), check)
+    assert found.effects == ("coulomb",)
+    assert "fixed at" not in found.text
+    fit = mi.fit(mi.dc_motor().fix(R=0.8 * lab.R) + mi.effects.coulomb + mi.effects.other_R, runs)
+    assert np.exp(fit.values["d_R"]) == pytest.approx(1.25, rel=0.02)
+    fit.save(tmp_path / "fit.json")
+    assert mi.load(tmp_path / "fit.json").values == fit.values
+    pickle.loads(pickle.dumps(fit)).save(tmp_path / "again.json")  # as it comes from another process
+    assert mi.load(tmp_path / "again.json").values == fit.values
+    assert "other_R" not in {c.effect for c in mi.diagnose(mi.fit(mi.dc_motor(), runs), check, max_effects=0).ranking}
 
 
 LIKE_STOPS = ("end_stop", "spring", "gravity", "constant_load", "coulomb", "lugre", "backlash", "compliance", "cogging")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from motorid.diagnosis.admissibility import objections, samples_within, unresolv
 from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.model_comparison import node_of
 from motorid.diagnosis.predictive_score import QUICK
-from motorid.diagnosis.score_test import believable_start, score
+from motorid.diagnosis.score_test import score
 from motorid.effects import LIBRARY
 from motorid.errors import ModelError
 from motorid.estimation.angle_orders import likely_lines, spectrum
@@ -100,16 +99,6 @@ def test_a_friction_that_varies_twice_a_turn_is_one_that_varies_over_a_turn():
 
 def test_an_effect_that_replaces_nothing_may_be_as_quick_as_it_likes(rubbing):
     assert unresolved(mi.fit(mi.dc_motor() + mi.effects.coulomb, rubbing), LIBRARY["coulomb"]) == ""
-
-
-def test_a_first_current_of_megamperes_is_no_start_of_another_model():
-    """Without a current, and with next to no inductance, it is but a kick; a winding that heats would melt."""
-    t = np.arange(50) * 1e-2
-    free, told = ({"v": 12 * np.ones(50)}, {"omega": t}), ({"v": 12 * np.ones(50)}, {"omega": t, "i": t})
-    runs = [mi.Experiment(t, *free), mi.Experiment(t, *free), mi.Experiment(t, *told)]
-    fit = SimpleNamespace(values={"R": 4.0}, problem=SimpleNamespace(experiments=runs),
-                          initial={"i_0[0]": -1.5e7, "i_0[1]": 0.4, "i_0[2]": 30.0, "omega_0[0]": 1e3})
-    assert believable_start(fit) == {"i_0[0]": -6.0, "i_0[1]": 0.4, "i_0[2]": 30.0, "omega_0[0]": 1e3}
 
 
 # -- what parameters do already ----------------------------------------------------------------------------

@@ -135,11 +135,11 @@ def test_an_error_over_a_motion_that_is_none_is_no_number_and_decides_nothing(ru
 
 
 def test_what_is_determined_does_not_depend_on_where_a_fit_without_current_ends(runs):
-    """Currents ten thousand times as large beside an R as much smaller are the same motor; first currents are some."""
+    """Currents ten thousand times as large beside an R as much smaller are the same motor; first ones are voltages."""
     fit = mi.fit(mi.dc_motor(), [r.without("i") for r in runs], window=0.4)
     problem, unknown = fit.problem, [p.name for p in fit.problem.unknown]
     assert any(n.startswith("i_0[") for n in unknown)
-    power = np.array([{"R": -1, "L": -1, "K": 0, "o": 0}.get(n[0], 1) for n in unknown])
+    power = np.array([{"R": -1, "L": -1, "J": 1, "b": 1}.get(n[0], 0) for n in unknown])
     q = problem.scaling.scaled(problem.scaling.physical(fit.q) * 1e4**power)
     r, jac = problem.residual_and_jacobian(q)
     assert r == pytest.approx(fit.residuals, rel=1e-3, abs=1e-3)

@@ -301,8 +301,7 @@ def noise_of_gaps(mesh: Mesh, z: Array) -> Array:
 
 
 def reduced(mesh: Mesh, z: Array) -> tuple[Array, Array]:
-    """Return residuals (n,) at `z` and their Jacobian (n, nq), the columns projected off those of the nodes: JᵀJ is the
-    Schur complement, its inverse the covariance of q with the nodes unknown."""
+    """Return residuals (n,) at `z` and their Jacobian (n, nq) projected off the nodes': JᵀJ is the Schur complement."""
     blocks = mesh.residual(z, mesh.walk(z, True))
     residual = np.concatenate([b.values for b in blocks])
     entries = np.concatenate([b.jac.ravel() for b in blocks])

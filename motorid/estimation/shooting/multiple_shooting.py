@@ -203,8 +203,7 @@ def _least_squares(problem: Problem, stages: bool) -> tuple[Problem, Array]:
 
 
 def _under_heavier_penalties(problem: Problem, q: Array) -> Array:
-    """Return values near the constrained solution: penalties on what is violated at `q`, heavier and heavier. A current
-    peak is lowered by resistance or by inductance, and the cost has a valley for each."""
+    """Return values near the constrained solution: penalties on what is violated at `q`, heavier and heavier."""
     if not any(otherwise({}, SimulationError, lambda: violations(problem, q)).values()):
         return q
     names = [p.name for p in problem.unknown]

@@ -212,8 +212,7 @@ def summed(found: Sequence[tuple[str, Part, Array, Array]]) -> tuple[tuple[Multi
 
 
 def below_steady(problem: Problem) -> str | None:
-    """Return a sentence if a current limit lies below a current that the records hold steadily; else None. Values that
-    keep such a limit exist, but they describe another motor."""
+    """Return a sentence if a current limit lies below a current that the records hold steadily, else None."""
     limits = (c for c in problem.constraints if isinstance(c, CurrentLimit))
     if (lowest := min(limits, key=lambda c: c.limit, default=None)) is None:
         return None
