@@ -124,8 +124,7 @@ class Link(Protocol):
 
 
 class SerialLink:
-    """An exclusively opened port: ``/dev/ttyACM0``, ``COM3`` or ``socket://127.0.0.1:7000``. Raises `DeviceError` if it
-    cannot be opened: it is not there, somebody else has it, or the user may not."""
+    """An exclusively opened port: ``/dev/ttyACM0``, ``COM3``, ``socket://host:port``; `DeviceError` if it cannot be."""
 
     def __init__(self, port: str, baud: int = 115_200) -> None:
         self.port = port

@@ -217,9 +217,8 @@ def left_out(residual: Array, columns: Array, labels: NDArray[np.intp]) -> Array
 
 
 def blocks_of(runs: Sequence[Experiment], evenly: bool = False) -> list[NDArray[np.intp]]:
-    """Return the block of each sample, `BLOCKS` a run: equal shares of its time and of what its outputs do. Of one step
-    with a long rest, blocks of equal length (`evenly`) would hold all that can be learnt in one or two: a gain there
-    would be no surer than chance. But a free curve is only extended over a short block."""
+    """Return the block of each sample, `BLOCKS` a run: equal shares of its time (`evenly`: of that alone) and of what
+    its outputs do, or all of one step would lie in one or two. A free curve is only extended over a short block."""
     found, first = [], 0
     for run in runs:
         parts = max(min(thresholds.BLOCKS, run.n // 2), 1)

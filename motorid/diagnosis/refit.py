@@ -135,8 +135,7 @@ def _on_its_own(along: Estimate, descent: Callable[[Problem], Estimate]) -> Esti
 
 
 def copies_the_angle(problem: Problem, q: Array) -> bool:
-    """Tell whether the simulated angle follows changes of the measured one that goes in: then it predicts nothing. That
-    is shaken a little: a simulated one that does the same, to within half, copies."""
+    """Tell whether the simulated angle copies the measured one that goes in: shaken a little, it does so, to half."""
     rng, runs, shakes = np.random.default_rng(0), [], []
     for run in problem.runs:
         theta = run.experiment.outputs["theta"]

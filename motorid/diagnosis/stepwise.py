@@ -178,9 +178,8 @@ def _still_alike(found: Climb) -> tuple[tuple[tuple[str, ...], ...], tuple[Fit, 
 
 
 def _beside_curves(found: Climb) -> Climb:
-    """Return a climb with grades that hold beside the curve that leads, fitted beside an effect that is a special case
-    of it, or in its place; where the error is plain to see, also beside one in the place of all that was found. Forms
-    are compared by slopes, and these lead astray far from the records."""
+    """Return a climb with grades that hold beside the curve that leads, fitted beside a special case of it, or in its
+    place; where the error is plain to see also in the place of all that was found: slopes lead astray far away."""
     search, best, grades = found.search, found.path[-1], list(found.grades)
     if (found.remaining.adequate and at_noise(best)) or all(g.grade == "approximates" for g in grades):
         return found

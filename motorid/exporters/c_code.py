@@ -25,8 +25,7 @@ TEMPLATES = Path(__file__).with_name("templates")  # C with $names
 
 
 def c_files(found: Fit | Model, path: Path) -> dict[Path, str]:
-    """Return ``NAME.c``, ``NAME.h``, ``NAME_main.c``, and of a fit its records ``NAME_run0.csv`` …, by their paths.
-    NAME is the stem of `path`, made a C identifier. See the header for the functions."""
+    """Return ``NAME.c``, ``NAME.h``, ``NAME_main.c`` and a fit's records, by their paths; the header tells the rest."""
     name = identifier(path.stem)
     fields = _fields(found, name)
     files = {path.with_name(f"{name}{ending}"): Template((TEMPLATES / file).read_text("utf-8")).substitute(fields)

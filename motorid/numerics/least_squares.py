@@ -259,8 +259,7 @@ def _cost(residual: Callable[[Array], Array], q: Array) -> tuple[Array, float]:
 
 
 def seen_directions(jac: Array) -> tuple[Array, Array]:
-    """Return H (n, r) with (JᵀJ)⁻¹ = HHᵀ, and the directions left out (m, n). Columns are scaled to unit length first;
-    directions with singular values below 1e-8 of the largest are left out."""
+    """Return H (n, r) with (JᵀJ)⁻¹ = HHᵀ, columns scaled, and directions left out (m, n), below 1e-8 of the largest."""
     norms = np.sqrt(np.einsum("ij,ij->j", jac, jac))
     size = np.where(norms > 0, norms, 1.0)
     _, s, vt = np.linalg.svd(np.linalg.qr(jac / size, mode="r"), full_matrices=True)

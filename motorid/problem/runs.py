@@ -262,9 +262,8 @@ def _first_speed(theta: Array, t: Array, sigma: float) -> tuple[float, float]:
 
 # -- natural sizes ---------------------------------------------------------------------------------------
 def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> dict[str, float]:
-    """Return the natural size of each unit in these records, for starting values and grids of effects: torque is what
-    the motor makes at its highest current, time the sample time, heat what the winding loses during the longest run for
-    a rise of 30 K; ``lowest`` and ``highest`` are the ends of the angle's travel."""
+    """Return the natural size of each unit in these records: torque is that at the highest current, time the sample
+    time, heat what the winding loses in the longest run for 30 K; ``lowest``, ``highest``: ends of the angle."""
     seen = [_sizes_of(r) for r in runs]
     volt = max(s.volt for s in seen) or 1.0
     speed = max(s.speed for s in seen) or volt / max(values.get("K", 1.0), 1e-9)
@@ -306,6 +305,14 @@ def spread_of(run: Experiment, channel: str) -> float:
 def top_speed(runs: Sequence[Experiment]) -> float:
     """Highest speed in the runs (99.5th percentile), from speed or angle; 0 where neither is there."""
     return max((_sizes_of(r).speed for r in runs), default=0.0)
+
+
+def top_acceleration(runs: Sequence[Experiment]) -> float:
+    """Largest acceleration over about 200 windows of a run, rad/s², from speed or angle; 0 for next to no samples."""
+    seen = [(r.t, r.outputs["omega"]) if "omega" in r.outputs else
+            (np.linspace(r.t[0], r.t[-1], len(speeds := window_slopes(r.t, r.outputs["theta"]))), speeds)
+            for r in runs if {"omega", "theta"} & r.outputs.keys()]
+    return max((float(np.abs(window_slopes(*known)).max(initial=0.0)) for known in seen), default=0.0)
 
 
 def suited(parameter: Parameter, sizes: Mapping[str, float]) -> Parameter:

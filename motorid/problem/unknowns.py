@@ -14,7 +14,7 @@ from motorid.channels import CHANNELS, UNITS
 from motorid.model.definition import Parameter
 from motorid.model.equations import System
 from motorid.numerics.signals import Array
-from motorid.problem.runs import Run, natural_sizes, spread_of
+from motorid.problem.runs import Run, natural_sizes, spread_of, top_acceleration
 from motorid.records.experiment import record_of
 
 
@@ -58,21 +58,20 @@ class Unknowns:
 
     @cached_property
     def initial(self) -> tuple[tuple[str, int, Parameter], ...]:
-        """(channel, run, parameter) of each estimated initial state; of a current that was not measured how far it is
-        from steady, as a voltage through R: whatever R and L, no kick at the start that no motor gives."""
+        """(channel, run, parameter) of each estimated initial state; of a current that was not measured by how it
+        accelerates the motor, whatever R and K: it is no kick at the start beyond what the records show."""
         found = []
         free = {c for c, stored in zip(self.system.states, self.system.stored, strict=True) if stored}
-        given = np.concatenate([run.experiment.inputs["v"] for run in self.runs])
-        volts = float(np.ptp(given) or np.abs(given).max()) or np.inf  # no step of the voltage is larger
+        quickest = top_acceleration([run.experiment for run in self.runs]) or np.inf
         for k, run in enumerate(self.runs):
             for c, (low, high) in run.limits.items():
                 if c in free:  # an algebraic current follows from the rest
-                    unit = run.experiment.units.get(c, UNITS[c][0])
+                    unit, begin = run.experiment.units.get(c, UNITS[c][0]), float(run.start[CHANNELS.index(c)])
                     if c == "i" and c not in run.experiment.outputs:
-                        unit, low, high = "V", -volts, volts
+                        unit, low, high = "rad/s²", min(-quickest, begin), max(quickest, begin)
                     if any(p.null == 0 and p.unit == unit for p in self.parameters.values()):
                         low, high = min(low, 0.0), max(high, 0.0)  # what was measured there may be the sensor's offset
-                    found.append((c, k, Parameter(f"{c}_0[{k}]", float(run.start[CHANNELS.index(c)]), unit, low, high)))
+                    found.append((c, k, Parameter(f"{c}_0[{k}]", begin, unit, low, high)))
         return tuple(found)
 
     @cached_property
@@ -153,13 +152,12 @@ class Unknowns:
         """Return dx0/dq (nx, nq) of run `k`, or the slopes (nx, m) along other directions of p (np, m)."""
         sensed = self.sensed(at, k)
         js, jp = self.system.first_slopes(sensed, at.p)
-        if self._settling(k):
-            R, K = (self.system.parameters.index(n) for n in "RK")
-            js, jp = js.copy(), jp.copy()
-            js[:, 0] /= at.p[R]
-            jp[:, R] -= js[:, 0] * sensed[0]
-            jp[:, K] -= js[:, 0] * sensed[1]
-            js[:, 1] -= js[:, 0] * at.p[K]
+        if self._accelerated(k):
+            (i, omega, _), js, jp = sensed, js.copy(), jp.copy()
+            (iJ, ib, iK), (J, b, K) = self._inertial(at)
+            by_current = js[:, :1] / K
+            jp[:, [iJ, ib, iK]] += by_current * np.array([(K * i - b * omega) / J, omega, -i])
+            js[:, :2] = np.hstack([by_current * J, js[:, 1:2] + by_current * b])
         if along is not None:
             return jp @ along
         rows, columns = self._places[k]
@@ -172,14 +170,18 @@ class Unknowns:
         rows, columns = self._places[k]
         start = self.runs[k].start.copy()
         start[rows] = at.physical[columns]
-        if self._settling(k):
-            R, K = (at.p[self.system.parameters.index(n)] for n in "RK")
-            start[0] = (self.runs[k].experiment.inputs["v"][0] - K * start[1] + start[0]) / R
+        if self._accelerated(k):
+            J, b, K = self._inertial(at)[1]
+            start[0] = (J * start[0] + b * start[1]) / K
         return start
 
-    def _settling(self, k: int) -> bool:
-        """Tell whether the first current of run `k` is unknown, as how far it still is from its steady value."""
+    def _accelerated(self, k: int) -> bool:
+        """Tell whether the first current of run `k` is unknown, as how it accelerates the motor."""
         return 0 in self._places[k][0] and "i" not in self.runs[k].experiment.outputs
+
+    def _inertial(self, at: Point) -> tuple[list[int], Array]:
+        """Return the places of J, b and K in p, and what they are."""
+        return (places := [self.system.parameters.index(n) for n in "JbK"]), at.p[places]
 
 
 @dataclass(frozen=True, eq=False)

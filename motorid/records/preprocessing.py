@@ -109,9 +109,8 @@ def without_spikes(t: Array, y: Array, v: Array, inert: bool = False) -> Array:
 
 
 def bursts(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
-    """Return which samples, two to `LONGEST` in a row, jump away and back, more than twice as far as the channel
-    changes from sample to sample anywhere else, at one voltage: what has a mass cannot. From rest and back to it, it
-    slips; what rings swings back by less than half, or again by more than half of that."""
+    """Return which samples, two to `LONGEST` in a row, jump away and back at one voltage, twice as far as ever else:
+    what has a mass cannot. From rest and back it slips; what rings swings back by less than half, or again."""
     seen = np.flatnonzero(np.isfinite(y))
     changes, level = np.diff(y[seen]), np.append(0, np.cumsum(np.abs(np.diff(v)) > 0.02 * np.ptp(v)))  # of the voltage
     sizes, least = np.abs(changes), 12 * noise_level(y, t)

@@ -80,9 +80,8 @@ def _steady_tail(k: int, run: Experiment, sigma: Mapping[str, float], first: int
 
 
 def _accelerating(run: Experiment, first: int, s: SteadySegment) -> float:
-    """Return the share of the drive that still accelerates in a part, by the way there from sample `first` on since the
-    speed was last about as far away as ever; 0 where it never was. That takes J/K Δω = ∫(i − ī)dt, and what is left
-    falls with ∫(ω̄ − ω)dt/Δω; without a current friction is viscous."""
+    """Return the share of the drive that still accelerates in a part, by the way there from sample `first` on; 0 if
+    none: it takes J/K Δω = ∫(i − ī)dt, and falls with ∫(ω̄ − ω)dt/Δω; without a current friction is viscous."""
     seen, level = run.outputs["omega" if "omega" in run.outputs else "theta"], s.means.get("i", s.means["omega"]) or 1.0
     y = bridged(run.t, seen)
     short = s.means["omega"] - (y if "omega" in run.outputs else slope(run.t, y, 4))

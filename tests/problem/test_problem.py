@@ -14,7 +14,7 @@ from motorid.errors import DataError, ModelError, UsageError
 from motorid.estimation.least_squares import RACE, least_squares
 from motorid.exporters.casadi_file import runs_of
 from motorid.problem.problem import as_problem
-from motorid.problem.runs import initial_state
+from motorid.problem.runs import initial_state, top_acceleration
 from motorid.problem.simulate import simulate
 from motorid.records.experiment import windows
 
@@ -210,21 +210,32 @@ def test_the_speed_at_the_start_may_come_from_the_angle_alone(rng):
     )
 
 
-def test_a_first_current_that_was_not_measured_is_near_the_one_that_the_voltage_drives(rng):
+def test_a_first_current_that_was_not_measured_accelerates_no_more_than_the_records_show(rng):
     """With next to no inductance 189 A through a megohm were but a kick at the start, which hid the inductance."""
     run = moving(rng, ("omega",))
     problem = mi.Problem(TRUE, [run])
     [current] = [p for p in problem.unknown if p.name == "i_0[0]"]
-    assert (current.unit, current.upper, current.value) == ("V", np.ptp(run.inputs["v"]), 0.0)
+    assert (current.unit, current.lower, current.upper) == ("rad/s²", -top_acceleration([run]), top_acceleration([run]))
     names, values = [p.name for p in problem.unknown], [p.value for p in problem.unknown]
-    values[names.index("i_0[0]")] = 1.5
-    q, steady = problem.scaling.scaled(values), run.inputs["v"][0] - VALUES["K"] * values[names.index("omega_0[0]")]
-    assert problem.simulate(q, 0).x[0, 0] == pytest.approx((steady + 1.5) / VALUES["R"])
+    values[names.index("i_0[0]")] = 150.0
+    q, drag = problem.scaling.scaled(values), VALUES["b"] * values[names.index("omega_0[0]")]
+    assert problem.simulate(q, 0).x[0, 0] == pytest.approx((150 * VALUES["J"] + drag) / VALUES["K"])
     assert mi.check_derivatives(problem.refined(q), q, tolerance=1e-5).ok
     fit = mi.fit(mi.dc_motor(), run)
     assert fit.misfit["omega"] < 1.1
+    assert fit.values["R"] < 1e3
     [(_, first, _)] = runs_of(fit.problem, fit.q)  # as it is exported
     assert first[:2] == pytest.approx([fit.simulations[0].states[c][0] for c in ("i", "omega")], rel=1e-6)
+
+
+def test_the_largest_acceleration_is_seen_in_speed_or_angle():
+    t = np.arange(2000) * 1e-3
+    omega = 30 * np.sin(5 * t)
+    fast, angle = (mi.Experiment(t, {"v": t}, y) for y in ({"omega": omega}, {"theta": -6 * np.cos(5 * t)}))
+    assert top_acceleration([fast]) == pytest.approx(150, rel=0.02)
+    assert top_acceleration([angle]) == pytest.approx(150, rel=0.02)
+    assert top_acceleration([fast, angle.with_(outputs={"theta": 0 * t})]) == pytest.approx(150, rel=0.02)
+    assert top_acceleration([]) == 0.0
 
 
 def test_a_speed_of_half_the_largest_is_no_rest_however_noisy_the_sensor(rng):
