@@ -98,8 +98,7 @@ def _undamped(r: Array, jac: Array) -> float:
 
 
 def finished(fit: Fit, best: Raced, effort: LevenbergMarquardt) -> Fit | None:
-    """Return the refit that a race began, converged with `effort`; None if it fails. Where it went along the measured
-    angle the model's own takes over, unless it drifts too far (by periods)."""
+    """Return the refit that a race began, converged with `effort`, along the model's own angle; None for none."""
     stages = "sgn_width" in best.problem.model.parameters and "sgn_width" not in fit.model.parameters
     along = partial(_released, best.problem) if best.angular else partial(QUICKLY, best.problem, wide=stages)
     done = otherwise(None, FAILURES, along)
@@ -209,8 +208,7 @@ def _polished(fit: Fit, problem: Problem, effort: LevenbergMarquardt) -> Fit | N
 
 
 def led_on(fit: Fit) -> Fit | None:
-    """Return a refit, which ends where further steps tell no two models apart, led on to its optimum; None for none.
-    Along the model's own angle, where with all effects that no longer drifts."""
+    """Return a refit led on to its optimum, along the model's own angle where that no longer drifts; None for none."""
     descent = partial(by_continuation, effort=OPTIMUM, wide=False)
     with contextlib.suppress(*FAILURES):
         done = _on_its_own(along := descent(fit.problem.begun_at(fit.q)), descent)
@@ -267,8 +265,7 @@ NEARLY = 0.9  # of the best promise: a smaller model with that is the favourite
 
 @dataclass(frozen=True)
 class Task:
-    """A model to be refitted on the records of `fit`, for an effect, from several starts. `promise` is the share of the
-    squared misfit that a score says it takes away, None without a score."""
+    """A model to be refitted for an effect, from several starts; `promise` is its drop by a score, if any."""
 
     fit: Fit
     model: Model
@@ -302,8 +299,7 @@ class GivenUp:
 
 
 def refits(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]]) -> list[Fit | GivenUp | None]:
-    """Return the refit of each task, None where none can be simulated; what is not done when the time is up, or when
-    it is interrupted, is given up. All are on the same records."""
+    """Return the refit of each task on the same records, None where none can be; what time left undone is given up."""
     found: dict[int, Fit | GivenUp | None] = {}
     try:
         _refit_all(tasks, map_, found)

@@ -62,7 +62,9 @@ class Unknowns:
         accelerates the motor, whatever R and K: it is no kick at the start beyond what the records show."""
         found = []
         free = {c for c, stored in zip(self.system.states, self.system.stored, strict=True) if stored}
+        held = sum(abs(p.value) for p in self.parameters.values() if p.null == 0 and p.unit in ("N·m", "N"))
         quickest = top_acceleration([run.experiment for run in self.runs]) or np.inf
+        quickest += held / self.parameters["J"].value  # what a load takes accelerates nothing
         for k, run in enumerate(self.runs):
             for c, (low, high) in run.limits.items():
                 if c in free:  # an algebraic current follows from the rest

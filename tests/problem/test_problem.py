@@ -221,6 +221,9 @@ def test_a_first_current_that_was_not_measured_accelerates_no_more_than_the_reco
     q, drag = problem.scaling.scaled(values), VALUES["b"] * values[names.index("omega_0[0]")]
     assert problem.simulate(q, 0).x[0, 0] == pytest.approx((150 * VALUES["J"] + drag) / VALUES["K"])
     assert mi.check_derivatives(problem.refined(q), q, tolerance=1e-5).ok
+    rubbing = mi.Problem(TRUE + mi.effects.coulomb(tau_c=5e-3), [run])
+    [current_of_that] = [p for p in rubbing.unknown if p.name == "i_0[0]"]  # what a load takes accelerates nothing
+    assert current_of_that.upper == pytest.approx(current.upper + 5e-3 / VALUES["J"])
     fit = mi.fit(mi.dc_motor(), run)
     assert fit.misfit["omega"] < 1.1
     assert fit.values["R"] < 1e3
