@@ -208,7 +208,7 @@ class Fit(Shown):
 
     @property
     def initial(self) -> dict[str, float]:
-        """Estimated initial states, as ``omega_0[run]``."""
+        """Estimated initial states, as ``omega_0[run]``; ``i_0[run]`` is in rad/s² where no current was measured."""
         physical = self.problem.scaling.physical(self.q)
         return {p.name: float(physical[j]) for j, p in enumerate(self.problem.unknown) if p.name not in self.values}
 
