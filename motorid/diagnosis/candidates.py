@@ -43,8 +43,7 @@ FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have 
 
 
 class Stages:
-    """What a search is at: words on what was done (`say`), and one bar over all rounds that it may take (`show`), on
-    which each lot of refits is taken for half of what is left of its round."""
+    """What a search is at: words on what was done (`say`), and one bar over all its rounds (`show`)."""
 
     def __init__(self, rounds: int = 0, say: Callable[[str], None] | None = None,
                  show: Callable[..., None] | None = None, map_: Callable[..., Iterable[Any]] = map) -> None:

@@ -115,8 +115,7 @@ def _filtered(a: Array, x: Array) -> Array:
 
 
 def autocovariance(parts: Sequence[Array], lags: int) -> Array:
-    """Return the sample autocovariance of residuals, one (N,) per run, at lags 0 … `lags`. Missing samples count as
-    zero, the mean too; the divisor, the number of samples, keeps it positive definite."""
+    """Return the sample autocovariance of residuals, one (N,) per run, at lags 0 … `lags`; missing ones are zero."""
     total = np.zeros(lags + 1)
     for r in parts:
         r = np.where(np.isfinite(r), r, 0.0)

@@ -59,8 +59,7 @@ def winsorised(r: Array) -> Array:
 
 
 def despiked(r: Array) -> Array:
-    """Return `r` (N,) without NaN, samples that stand alone far from both neighbours replaced by the middle of three. A
-    few large samples in a row are no outliers: there the model fails."""
+    """Return `r` (N,) without NaN, lone outliers replaced by the middle of three; a few in a row are the model's."""
     r = r[np.isfinite(r)]
     if len(r) < 3:
         return r

@@ -63,7 +63,8 @@ class Unknowns:
         found = []
         free = {c for c, stored in zip(self.system.states, self.system.stored, strict=True) if stored}
         held = sum(abs(p.value) for p in self.parameters.values() if p.null == 0 and p.unit in ("N·m", "N"))
-        quickest = top_acceleration([run.experiment for run in self.runs]) or np.inf
+        alone = [run.experiment for run in self.runs if "i" in run.limits and "i" not in run.experiment.outputs]
+        quickest = (top_acceleration([run.experiment for run in self.runs]) if alone else 0.0) or np.inf
         quickest += held / self.parameters["J"].value  # what a load takes accelerates nothing
         for k, run in enumerate(self.runs):
             for c, (low, high) in run.limits.items():
@@ -89,7 +90,8 @@ class Unknowns:
             natural = natural_sizes([r.experiment for r in self.runs], {n: p.value for n, p in self.parameters.items()})
             sizes = [s if p.positive else max(s, natural.get(p.unit, 0.0))
                      for p, s in zip(self.free, sizes, strict=True)]
-        spreads = [spread_of(self.runs[k].experiment, c) for c, k, _ in self.initial]
+        spreads = [p.upper if c == "i" and self._accelerated(k) and np.isfinite(p.upper) else
+                   spread_of(self.runs[k].experiment, c) for c, k, p in self.initial]
         return Scaling.of(self.all, [*sizes, *spreads, *(natural.get(p.unit, 1.0) for *_, p in self.apart)])
 
     @cached_property
@@ -156,7 +158,7 @@ class Unknowns:
         js, jp = self.system.first_slopes(sensed, at.p)
         if self._accelerated(k):
             (i, omega, _), js, jp = sensed, js.copy(), jp.copy()
-            (iJ, ib, iK), (J, b, K) = self._inertial(at)
+            (iJ, ib, iK), (J, b, K) = self._inertial, at.p[self._inertial]
             by_current = js[:, :1] / K
             jp[:, [iJ, ib, iK]] += by_current * np.array([(K * i - b * omega) / J, omega, -i])
             js[:, :2] = np.hstack([by_current * J, js[:, 1:2] + by_current * b])
@@ -173,7 +175,7 @@ class Unknowns:
         start = self.runs[k].start.copy()
         start[rows] = at.physical[columns]
         if self._accelerated(k):
-            J, b, K = self._inertial(at)[1]
+            J, b, K = at.p[self._inertial]
             start[0] = (J * start[0] + b * start[1]) / K
         return start
 
@@ -181,9 +183,10 @@ class Unknowns:
         """Tell whether the first current of run `k` is unknown, as how it accelerates the motor."""
         return 0 in self._places[k][0] and "i" not in self.runs[k].experiment.outputs
 
-    def _inertial(self, at: Point) -> tuple[list[int], Array]:
-        """Return the places of J, b and K in p, and what they are."""
-        return (places := [self.system.parameters.index(n) for n in "JbK"]), at.p[places]
+    @cached_property
+    def _inertial(self) -> list[int]:
+        """Places of J, b and K in p."""
+        return [self.system.parameters.index(n) for n in "JbK"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -68,7 +68,7 @@ def test_a_value_that_was_fixed_wrong_is_told_before_a_sensor_is_blamed(lab, nam
     found = mi.diagnose(mi.fit(mi.dc_motor().fix(**{name: factor * true}), runs), check)
     assert f"other_{name}" in {*found.effects, *(n for group in found.groups for n in group)}, found.text
     assert f"{name}, fixed at" in found.text
-    assert found.text.endswith(f"model.free('{name}') estimates it.") or "would distinguish" in found.text
+    assert f"model.free('{name}') estimates it." in found.text
     assert "measure the" not in found.text
     assert found.remaining.adequate
     freed = next(f for f in found.rivals if f"other_{name}" in f.model.effect_names)

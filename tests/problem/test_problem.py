@@ -217,6 +217,7 @@ def test_a_first_current_that_was_not_measured_accelerates_no_more_than_the_reco
     [current] = [p for p in problem.unknown if p.name == "i_0[0]"]
     assert (current.unit, current.lower, current.upper) == ("rad/s²", -top_acceleration([run]), top_acceleration([run]))
     names, values = [p.name for p in problem.unknown], [p.value for p in problem.unknown]
+    assert problem.scaling.scale[names.index("i_0[0]")] == current.upper  # its natural size: steps of 1 are none
     values[names.index("i_0[0]")] = 150.0
     q, drag = problem.scaling.scaled(values), VALUES["b"] * values[names.index("omega_0[0]")]
     assert problem.simulate(q, 0).x[0, 0] == pytest.approx((150 * VALUES["J"] + drag) / VALUES["K"])
