@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from motorid.diagnosis.admissibility import MELTS, hottest, objections
-from motorid.diagnosis.free_forms import own_levels
+from motorid.diagnosis.free_forms import FORMS, may_be_zeroed, own_levels, zeros_of
 from motorid.diagnosis.misspecification import LIMITER
 from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, far, node_of, preferred, superfluous
 from motorid.diagnosis.predictive_score import QUICK, Evidence, HeldOut, deciding
@@ -39,6 +39,8 @@ SHORTLIST = 6
 PAIRS = 3  # refitted where no single effect helps, and beside one that is refused
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
 ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast")  # their score at null says little
+OVER_TURN = next(f for f in FORMS if (f.balance, f.carrier, f.on) == ("torque", "direction", "turn"))
+MEETING = {"end_stop": ("spring",)}  # what they become where their places meet; a motor may have both
 FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have a limit
 
 
@@ -205,6 +207,10 @@ class Search:
         if (zero := own.get("encoder_zero")) and zero.name not in model.effect_names:
             found = with_phase_per_run(deciding(node.fit), self.scores(node), zero)
             tasks += [Task(node.fit, model + s.effect + zero, s.effect, s.starts, s.drop) for s in found]
+            for e in self._takeable(model)[1] if may_be_zeroed(node.fit) else ():
+                if e.balance == "torque" and uses_angle(e):  # a friction
+                    task, zeros = widened(node.fit, e), zeros_of(node.fit, OVER_TURN)
+                    tasks.append(replace(task, model=task.model + zero, starts=[{**s, **zeros} for s in task.starts]))
         if warm := own.get("winding_warm_start"):
             found = with_warm_start(deciding(node.fit), self.scores(node), LIBRARY["winding_heating"])
             tasks += [Task(node.fit, model + s.effect + warm, s.effect, s.starts, s.drop) for s in found]
@@ -342,7 +348,8 @@ class Search:
 
     def _simpler(self, model: Model, effect: Effect) -> list[Model]:
         """Return the model with each simpler one of its kind in the place of an effect."""
-        inside = [e for e in self.effects if e.name in effect.includes and e.name not in model.effect_names]
+        simpler = {*effect.includes, *MEETING.get(effect.name, ())}
+        inside = [e for e in self.effects if e.name in simpler and e.name not in model.effect_names]
         return [m for e in inside if (m := _in_place(model, effect, e)) is not None]
 
     def brought_to_its_end(self, node: Node) -> Node:

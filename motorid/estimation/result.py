@@ -24,7 +24,7 @@ from motorid.problem import simulate
 from motorid.problem.plain_data import model_dict, problem_dict
 from motorid.problem.problem import Problem
 from motorid.problem.simulate import NRMSE, Evaluation, Simulation, error_table, evaluate, judge, largest, moving
-from motorid.records.experiment import Experiment, units_of
+from motorid.records.experiment import Experiment, record_of, units_of
 from motorid.records.files import json_text, write_files
 from motorid.records.steady_state import find_segments
 
@@ -467,7 +467,10 @@ class Comparison(Printed):
 
     def card(self) -> Card:
         """Return errors and parameters side by side."""
-        return Card(f"Comparison of {counted(len(self.fits), 'fit')}",
+        records = {frozenset(map(record_of, f.problem.experiments)) for f in self.fits}
+        apart = ("Not all were fitted to the same records (or to these as read): only held-out errors compare, "
+                 "validate=runs." if len(records) > 1 else "")
+        return Card(f"Comparison of {counted(len(self.fits), 'fit')}", text=(apart,),
                     tables=(comparison_table([(f.model.title, f) for f in self.fits], self.validation_nrmse),),
                     after=(("mi.plot_parameters(*comparison.fits)", "how the parameters moved"),))
 

@@ -353,7 +353,7 @@ def _over_time(ax: Axes, sims: Sequence[Simulation], channel: str, sigma: float)
         t = s.experiment.t - s.experiment.t[0]
         style.line(ax, t + shift, s.residual(channel), color=style.RESIDUAL, lw=0.8)
         if len(sims) <= 6:
-            ax.annotate(s.experiment.name, (shift, 1), (3, -2), xycoords=("data", "axes fraction"),
+            ax.annotate(style.short(s.experiment.name), (shift, 1), (3, -2), xycoords=("data", "axes fraction"),
                         textcoords="offset points", va="top", fontsize=7, color=style.MUTED,
                         bbox={"facecolor": style.PAPER, "alpha": 0.8, "lw": 0, "pad": 1})
         shift += float(t[-1])

@@ -205,7 +205,7 @@ def _simulations(result: Any) -> list[Simulation]:
 
 def _run_title(run: Experiment, k: int, every: Sequence[Experiment]) -> str:
     more = len(every) - COLUMNS
-    return f"{run.name}   (and {more} more not shown)" if more > 0 and k == COLUMNS - 1 else run.name
+    return style.short(run.name) + f"   (and {more} more not shown)" * (more > 0 and k == COLUMNS - 1)
 
 
 def _absent(ax: Axes, channel: str) -> None:
@@ -352,7 +352,7 @@ def plot_current_limit(*results: Fit | Formulations, limit: float | None = None,
             _against_limit(ax, s, limit)
         row[0].set(ylabel=f"{word}\n{style.axis_label('i')}")
     for k, (top, bottom) in enumerate(zip(axes[0], axes[-1], strict=True)):
-        top.set(title=fits[0].simulations[k].experiment.name)
+        top.set(title=style.short(fits[0].simulations[k].experiment.name))
         bottom.set(xlabel="time (s)")
         _zoom(bottom, [f.simulations[k] for f in fits], limit)
     axes[0, 0].figure.align_ylabels(axes[:, 0])

@@ -210,6 +210,11 @@ def plain_decades(ax: Axes) -> None:
     ax.tick_params(which="minor", color=FAINT)
 
 
+def short(name: str, most: int = 28) -> str:
+    """Return the name of a run with its middle left out where it would run over its neighbours."""
+    return name if len(name) <= most else f"{name[:most // 2]}…{name[-(most // 2):]}"
+
+
 def decade(size: float) -> int:
     """Return the power of ten to take out of numbers of this size; 0 where they read well as they are."""
     power = int(np.floor(np.log10(size))) if size > 0 and np.isfinite(size) else 0

@@ -1,7 +1,7 @@
 """From columns as they were logged to a valid run: order in time, gaps, missing cells; each loss is noted."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, cast
 
@@ -18,6 +18,8 @@ from motorid.records.preprocessing import unwrapped
 Texts = Mapping[str, Sequence[object]]
 
 _RUNS = ("run", "run_id", "trial", "test", "experiment", "motor_id", "messung", "versuch", "essai")
+_NINES = [10.0**k - 1 for k in range(3, 8)]
+_MARKS = [sign * n for sign in (-1, 1) for n in (*_NINES, *(2.0**k - m for k in (15, 16, 31, 32) for m in (0, 1)))]
 _LATE = 2  # this many rows in a row may come late before it counts as a new start of time
 
 
@@ -29,6 +31,7 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     columns = {n: np.where(np.isnan(c), np.nan, c) for n, c in columns.items()}  # one of a damaged file may signal
     places = dict(layout.places)
     t = _time(columns, texts, places.pop("t"), said)
+    _without_marks(columns, {p.column for p in places.values()} - {*texts}, said)
     values = {c: _channel(columns, texts, place, c) for c, place in places.items()}
     rows, t, begun = _rows_in_order(t, layout.places["t"].column, said)
     first = _first_input(values["v"][rows], places["v"].column, said)
@@ -68,6 +71,17 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
         return Experiment(t, inputs, outputs, sigma, cast(Any, hold), units, name, facts)
     except DataError as error:
         raise DataError(str(error).removeprefix(f"{name}: ")) from None
+
+
+def _without_marks(columns: dict[str, Array], used: Iterable[str], said: list[str]) -> None:
+    """Count as missing what loggers write where nothing was measured: a number of `_MARKS`, far from all others."""
+    for name in sorted(used):
+        marked = np.isin(y := columns[name], _MARKS)
+        rest = y[~marked & np.isfinite(y)]
+        for mark in np.unique(y[marked]) if rest.size else ():
+            if np.abs(rest - mark).min() > np.ptp(rest):
+                y[y == mark] = np.nan
+                said.append(f"'{name}' holds {mark:g}, far from all other values: taken for a missing sample.")
 
 
 def _going_on(measured: Mapping[str, Array], t: Array, column: str, said: list[str]) -> Array:

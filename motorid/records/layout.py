@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from motorid.channels import CHANNELS, DIMENSIONS, MEASURED_INPUTS, NAMES, SI
@@ -62,7 +62,8 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
                      f"not known; to use it, say units={{'{channel}': 'counts:2048'}}.")
     _require(places, labels, values or {})
     free = [c for c in labels if c not in {x for p in places.values() for x in (p.column, p.times)}]
-    others = [c for c in free if c in (values or labels) and not headers.is_reference(c)]
+    wrong = _in_wrong_units(free, row, {*places, *(columns or {})}, notes)
+    others = [c for c in free if c in (values or labels) and not headers.is_reference(c) and c not in wrong]
     if others and not {"omega", "theta"} & {*places, *(columns or {}), *unscaled}:
         notes.append(f"not used: {', '.join(others[:20])}; if one of them is the speed or the angle, name it with "
                      f"columns={{'omega': '{'y' if 'y' in others else others[0]}'}}.")
@@ -74,6 +75,20 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     notes += [f"took {', '.join(guesses)}, a guess from the headers; override with columns."] if guesses else []
     notes += [f"no unit stated, assuming {', '.join(plain)}; override with units."] if plain else []
     return Layout({c: places[c] for c in DIMENSIONS if c in places}, notes)
+
+
+def _in_wrong_units(free: Sequence[str], row: Units, known: Container[str], notes: list[str]) -> list[str]:
+    """Note and return the columns named like a channel that is not `known`, in a unit that it cannot have."""
+    found = []
+    for label in free:
+        name, unit, sure = headers.unit_in(label)
+        hit = headers.classify(name) if (unit := row[label] or (unit if sure else None)) else None
+        if hit and unit and hit.score >= 3 and hit.channel not in known and not any(label in n for n in notes):
+            found.append(label)
+            c, one = hit.channel, f"0.001 {SI[DIMENSIONS[hit.channel][0]]}"
+            notes.append(f"not used: '{label}'; it is named like {_MEANING[c]}, and {unit.label} is no unit of that. "
+                         f"Say how much one is: columns={{'{c}': '{label}'}}, units={{'{c}': '{one}'}}.")
+    return found
 
 
 def _named_by_user(labels: Sequence[str], columns: Mapping[str, object], units: Mapping[str, object],

@@ -19,6 +19,7 @@ from motorid.records.binary_tables import FORMATS, frame_table, mat_table
 from motorid.records.cleaning import run_from_columns
 from motorid.records.experiment import Experiment, between_pauses
 from motorid.records.files import read_bytes, write_files
+from motorid.records.headers import classify
 from motorid.records.layout import assign, first_of_its_name, parse_pairs
 from motorid.records.text_tables import TextTable, parse_table
 
@@ -30,6 +31,9 @@ _HEADERS = {("t", "s"): "time_s", ("v", "V"): "voltage_V", ("v", "A"): "command_
             ("theta", "m"): "position_m", ("v_supply", "V"): "supply_V", ("tau_load", "N·m"): "load_torque_Nm",
             ("tau_load", "N"): "load_force_N", ("temp", "°C"): "temperature_degC"}
 _OWN = re.compile(r"#\s*motorid (columns|hold|sigma): (.*)")  # what write_csv says about its own file
+_SECONDS = re.compile(r"(.*?)(?:s|secs?|seconds)", re.IGNORECASE)
+_FRACTION = re.compile(r"(.*?)(n|nano|u|micro|m|milli)(?:s|secs?|seconds)", re.IGNORECASE)
+_SIZES = {"n": 1e-9, "nano": 1e-9, "u": 1e-6, "micro": 1e-6, "m": 1e-3, "milli": 1e-3}
 _PART = re.compile(r"#\s*part begins: (\d+\.?\d*)")  # what a resumed recording says, s
 
 
@@ -209,8 +213,9 @@ def _of_table(table: TextTable, columns: Mapping[str, object] | None, units: Map
         columns = {**parse_pairs(own["columns"], "columns"), **(columns or {})}
         labels = [c for c in labels if c in columns.values()]
     labels = [c for c in labels if not _is_copy(c, labels, table)]
+    table, labels, columns = _with_whole_stamps(table, labels, columns or {})
     if dt is not None:
-        table, columns, units = _timed(table, columns or {}, units or {}, dt)
+        table, columns, units = _timed(table, columns, units or {}, dt)
         labels = [*labels, columns["t"]]
     layout = assign(labels, columns=columns, units=units, unit_row=table.unit_row, values=table.columns)
     parts = tuple(float(m[1]) for m in map(_PART.fullmatch, table.comments) if m)
@@ -220,6 +225,27 @@ def _of_table(table: TextTable, columns: Mapping[str, object] | None, units: Map
         raise DataError(f"cannot read the noise levels '{own['sigma']}' in its comments.") from None
     return run_from_columns(table.columns, table.texts, layout, name=name, hold=hold or own.get("hold", "zoh"),
                             sigma=sigma, meta={**meta, "parts": parts}, notes=table.notes)
+
+
+def _with_whole_stamps(table: TextTable, labels: Sequence[str], columns: Mapping[str, object]
+                       ) -> tuple[TextTable, list[str], Mapping[str, object]]:
+    """Put time stamps together that come as seconds and a fraction (``stamp.sec``, ``stamp.nanosec``); the first of
+    them is the time where neither the user nor a header names another."""
+    sums, asked = dict[str, str](), {str(column) for column in columns.values()}
+    wholes = {m[1]: c for c in labels if c in table.columns and (m := _SECONDS.fullmatch(c))}
+    for fine in labels:
+        m = _FRACTION.fullmatch(fine)
+        if m and m[1] in wholes and fine in table.columns and fine not in asked:
+            s, part = table.columns[whole := wholes[m[1]]], table.columns[fine] * _SIZES[m[2].lower()]
+            if np.all((part >= 0) & (part < 1) | np.isnan(part)) and np.isfinite(s).any():
+                table = replace(table, columns={**table.columns, whole: s - s[np.isfinite(s)][0] + part})
+                sums[whole] = fine
+    named = {hit.channel for c in labels if c not in sums and (hit := classify(c)) and hit.score > 1}
+    if sums and "t" not in {*columns} | named:
+        first = next(iter(sums))
+        columns = {**columns, "t": first}
+        table = replace(table, notes=[*table.notes, f"'{first}' and '{sums[first]}' together are the time."])
+    return table, [c for c in labels if c not in sums.values()], columns
 
 
 def _timed(table: TextTable, columns: Mapping[str, object], units: Mapping[str, object],

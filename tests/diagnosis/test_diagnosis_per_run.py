@@ -132,3 +132,27 @@ def test_what_was_named_without_an_angle_can_be_fitted_by_name():
     found = mi.fit(mi.dc_motor() + mi.effects.cogging + mi.effects.encoder_zero, runs)
     assert found.values["N"] == 6
     assert max(found.nrmse.values()) < 0.01
+
+
+def test_a_bent_shaft_under_such_an_encoder_is_named_in_the_place_of_dry_friction(rng):
+    def bent(zero):
+        return (BASE + mi.effects.angular_friction).replace(tau_m=1e-2, a_f=0.6, N_f=1.0, phi_f=0.5 + zero)
+
+    runs = records(map(bent, (0.0, 1.9, -2.2)), (2.0, -2.5, 1.5), rng, noise=(0.02, 0.3, 2e-3), n=800)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=["coulomb", "angular_friction", *TRIED[:2],
+                                                                           "encoder_zero"])
+    assert set(found.effects) == {"angular_friction", "encoder_zero"}, found.text
+    assert found.after.values["a_f"] == pytest.approx(0.6, rel=0.02)
+    assert found.to_dict()["per_run"]["z_0"]["-2.5 V"]["value"] == pytest.approx(1.9, abs=0.02)
+
+
+def test_stops_that_leave_no_travel_between_them_are_a_spring(rng):
+    sprung = (BASE + mi.effects.spring).replace(k_s=0.02, theta_0=0.1)
+    t = np.arange(500) * 1e-3
+    bare = [mi.Experiment(t, {"v": drive(t, v)}, {"i": 0 * t, "theta": 0 * t}, name=f"{v} V") for v in (4.0, -6.0)]
+    runs = [r.with_(outputs={c: mi.simulate(sprung, r, initial="rest")[0].outputs[c] + s * rng.normal(size=500)
+                             for c, s in (("i", 0.02), ("theta", 1e-3))}) for r in bare]
+    stops = (mi.dc_motor(**VALUES) + mi.effects.end_stop).replace(k_stop=0.02, theta_lo=0.1, theta_hi=0.1, d_stop=1e-4)
+    search = Search(mi.fit(mi.dc_motor(), runs), None, library(["spring", "end_stop"]), Stages())
+    node = node_of(mi.fit(stops, runs, start="model"), search.held)
+    assert search.pruned(node, search.root).key == {"spring"}

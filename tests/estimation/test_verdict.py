@@ -52,6 +52,9 @@ def test_the_same_fit_asked_in_six_ways_gives_one_standard_deviation(plain, tmp_
     # and fits side by side
     assert mi.compare([plain]).parameters["b"] == ((plain.values["b"], told),)
     assert shown in mi.compare([plain]).card().to_html()
+    assert "same records" not in mi.compare([plain, plain]).card().to_html()
+    other = mi.fit(mi.dc_motor(), plain.problem.experiments[:1])
+    assert "Not all were fitted to the same records" in mi.compare([plain, other]).card().to_html()
 
 
 def test_a_fit_that_misses_a_quarter_of_the_current_says_so_first(plain, tmp_path):

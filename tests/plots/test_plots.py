@@ -178,6 +178,15 @@ def test_short_records_are_drawn_sample_by_sample():
     assert envelope(t, t**2)[1].size == 500
 
 
+def test_a_long_name_runs_over_no_neighbour():
+    name = "2024-11-03_bench4_motor_A17_steps_recorded_at_night"
+    runs = [r.with_(name=f"{name}_{k}") for k, r in enumerate(hand_made.friction()[0])]
+    axes = np.ravel(plots.plot_fit(mi.fit(mi.dc_motor(), runs)))
+    titles = [t for a in axes for t in (a.get_title(), a.get_title("left")) if t]
+    assert any("…" in t and t.endswith("_0") for t in titles)
+    assert max(map(len, titles)) <= 29
+
+
 def test_the_title_tells_the_error_of_the_run_it_stands_on(found):
     axes = plots.plot_fit(found.before)
     assert axes[0, 0].get_title(loc="right") == f"NRMSE {100 * found.before.evaluation.by_run[0]['i']:.3g} %"

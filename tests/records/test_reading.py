@@ -297,6 +297,20 @@ def test_dates_and_large_clocks_count_from_the_first(tmp_path):
         assert "counted" in notes(run)
 
 
+@pytest.mark.parametrize(("whole", "fine", "size"), [
+    ("header.stamp.sec", "header.stamp.nanosec", 1e-9), ("field.header.stamp.secs", "field.header.stamp.nsecs", 1e-9),
+    ("tv_sec", "tv_usec", 1e-6)])
+def test_stamps_in_seconds_and_a_fraction_are_one_time(tmp_path, whole, fine, size):
+    t = 0.6 + 0.25 * np.arange(20)
+    body = [f"{1700000000 + int(s)},{round(s % 1 / size)},1,{k}\n" for k, s in enumerate(t)]
+    run = read_csv(write(tmp_path, f"{whole},{fine},u,w\n" + "".join(body)))
+    np.testing.assert_allclose(run.t - run.t[0], t - t[0], atol=1e-9)
+    assert f"'{whole}' and '{fine}' together are the time" in notes(run)
+    other = read_csv(write(tmp_path, f"{whole},{fine},u,w,time\n" + "".join(
+        f"{row.strip()},{k}\n" for k, row in enumerate(body))))
+    np.testing.assert_allclose(other.t, np.arange(20))  # a plain name goes first
+
+
 # -- rows ---------------------------------------------------------------------------------------------------
 
 
@@ -313,6 +327,17 @@ def test_missing_outputs_stay_missing_and_missing_inputs_are_held(tmp_path):
     np.testing.assert_array_equal(run.outputs["omega"], [1, np.nan, 3, np.nan, 5, np.nan, 7, 8, 9, 10, 11])
     for part in ("first 1 row", "missing in 2 of 11 rows", "missing in 3 of 11", "1 cell of 'w_rad_s'"):
         assert part in notes(run)
+
+
+@pytest.mark.parametrize("mark", [-9999, 9999, -999, 65535, -32768])
+def test_the_mark_of_a_missing_sample_is_no_value(mark, tmp_path):
+    w = [0, 1, mark, 3, 4, mark, 6, 7, 8, 9]
+    run = read_csv(write(tmp_path, table(range(10), [1] * 10, w)))
+    np.testing.assert_array_equal(run.outputs["omega"], [0, 1, np.nan, 3, 4, np.nan, 6, 7, 8, 9])
+    assert f"'w_rad_s' holds {mark}" in notes(run)
+    assert "missing in 2 of 10" in notes(run)
+    near = read_csv(write(tmp_path, table(range(10), [1] * 10, np.linspace(0, mark, 10).round())))
+    assert near.outputs["omega"][-1] == mark  # a value like the others
 
 
 @pytest.mark.parametrize(("t", "dropped", "note"), [
@@ -740,3 +765,13 @@ def test_a_voltage_that_hardly_changes_beside_a_duty_cycle_is_the_supply(voltage
     for key in ("v", "voltage"):
         (scaled,) = read_runs([table], units={key: "mV"})
         assert scaled.inputs["v"] == pytest.approx(1e-3 * table["voltage"].to_numpy())
+
+
+@pytest.mark.parametrize("header", ["current [counts]", "motor current (%)", "current [V]"])
+def test_a_column_in_a_unit_that_its_name_cannot_have_is_told(tmp_path, header):
+    text = f"time_s,voltage_V,{header},speed_rad_s\n" + _body(lambda k: f"{k * 1e-3:.3f}")
+    run = read_csv(write(tmp_path, text))
+    assert run.channels == ("omega",)
+    assert f"not used: '{header}'; it is named like the current" in notes(run)
+    run = read_csv(write(tmp_path, text), columns={"i": header}, units={"i": "0.5 A"})
+    assert run.outputs["i"] == pytest.approx(0.5 * np.round(np.sin(np.arange(60)), 4), abs=1e-9)
