@@ -202,8 +202,9 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     A rung that predicts better stays, whatever it is. Its effect is *named* if its law is physical there and its size
     more than two of its deviations, the model with it follows the records, no rival predicts as well, no free form that
     contains it, or in its place, predicts better by more than the trifle that a free curve follows in any real motor
-    and by more than a trifle of what the effect itself does, and it explains more than it leaves, unless that is noise
-    (no `structure`). A form `beside` the effect that predicts surely less than the best one only imitates that.
+    and by more than a trifle of what the effect itself does, and it explains more than it leaves, on held-out runs too,
+    unless that is noise (no `structure`). A form `beside` the effect that predicts surely less than the best one only
+    imitates that.
     `without` gives the model without one of the effects, if there is one.
     """
     rivals = {g[0]: g[1:] for g in groups}
@@ -220,12 +221,13 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
             free = [b for b in beside if not compare(b.predictions, beside[0].predictions).sure]
             free = [b for b in free if (differs(last.fit, b.form, e) or 0.0) > TRIFLE]
             free = free or better_forms(smaller.fit, last.fit)
-            fall = evidence(smaller, last).fall
+            did = evidence(smaller, last)
+            fall, least = did.fall, did.fall if did.held_out_fall is None else min(did.fall, did.held_out_fall)
             told = [b for b in free if outdoes(fall, b.evidence.fall)]
             better = next((b for b in told if beside and b.form == beside[0].form), told[0] if told else None)
             if better is not None:
                 form, why = better.form, IN_ITS_PLACE.format(better.form.text)
-            elif 1 - (1 - max(fall, 0.0)) ** 2 < (UNCONTESTED if e.balance == "transmission" else MOST):
+            elif 1 - (1 - max(least, 0.0)) ** 2 < (UNCONTESTED if e.balance == "transmission" else MOST):
                 share = share_of(e.name, last, smaller)
                 most = f"{percent(share, 2)} of" if share > 0 else "nothing, over all channels, of"
                 why = f"it removes {most} the squared error, and the rest is not noise"

@@ -30,7 +30,7 @@ from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.estimation.start_values import with_suited_effects
 from motorid.numerics.least_squares import LevenbergMarquardt
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, gather
 from motorid.problem.problem import Problem
 from motorid.problem.runs import angle_signal
 from motorid.problem.simulate import at, judge, misfit_over_noise, moving
@@ -222,12 +222,16 @@ class Reading:
 
 
 def without_spikes(fit: Fit) -> Reading | None:
-    """Return the reading that leaves out the spikes of a sensor; None without any, or if the loss forgives them."""
+    """Return the reading that leaves out the spikes of a sensor; None without any, if the loss forgives them, or where
+    they gather at angles of a turn: a wheel that lacks a tooth is no accident."""
     if fit.problem.loss is not None:
         return None
     runs = fit.problem.experiments
-    gone = [np.isfinite(y) & ~np.isfinite(quiet.outputs[c])
-            for run, quiet in ((r, r.without_spikes()) for r in runs) for c, y in run.outputs.items()]
+    every = [(run, np.isfinite(y) & ~np.isfinite(quiet.outputs[c]))
+             for run, quiet in ((r, r.without_spikes()) for r in runs) for c, y in run.outputs.items()]
+    gone = [g for _, g in every]
+    if gather([(angle_signal(run), g) for run, g in every if "theta" in run.outputs and g.any()]):
+        return None
     count, in_a_row = sum(map(np.count_nonzero, gone)), any((g[1:] & g[:-1]).any() for g in gone)
     says = (f"{count} {'samples, some of them in a row,' if in_a_row else 'single samples'} stand far from both "
             "neighbours, which no motor can do, and are left out")

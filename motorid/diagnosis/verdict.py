@@ -19,7 +19,8 @@ from motorid.estimation.covariance import UNDETERMINED
 from motorid.estimation.result import Fit, parameter_cell
 from motorid.model.model import SHOWN
 from motorid.numerics.autoregression import colour_of
-from motorid.numerics.signals import despiked
+from motorid.numerics.signals import despiked, gather
+from motorid.problem.runs import angle_signal
 from motorid.problem.simulate import moving
 
 MOVED = 0.1  # relative change of a motor parameter that is worth a word
@@ -310,9 +311,13 @@ def outliers_remark(fit: Fit) -> str:
         spikes = int(np.count_nonzero(r != kept))
         if spikes and kept @ kept < (1 - SPIKED) * (r @ r):
             share = percent(1 - float(kept @ kept) / float(r @ r), 2)
+            turns = [(angle_signal(s.experiment)[known := np.isfinite(p)], p[known] != despiked(p)) for s, p in zip(
+                (s for s in fit.simulations if c in s.experiment.outputs), parts, strict=True)
+                if "theta" in s.experiment.outputs]
+            there = " They gather at angles of a turn: does a wheel lack a tooth?" * gather(turns)
             return (f"{counted(spikes, 'outlier')} (single samples) make{'s' * (spikes == 1)} {share} of the "
                     f"squared error of {c}, and least squares follows. A robust loss (--loss huber, loss=mi.Huber()) "
-                    "shows the rest better.")
+                    f"shows the rest better.{there}")
     return ""
 
 

@@ -130,6 +130,7 @@ def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units
                      without: Sequence[str]) -> None:
     """Add the channels that the header names, where the user has not named them, or wants to do `without`."""
     found, named = dict[str, list[Place]](), {*CHANNELS} & {*places}  # who names one need not want another
+    measured = named - {"v"}
     for label in labels:
         if hit := headers.classify(first_of_its_name(label, labels), row[label]):
             place = Place(label, hit.unit or _default(hit.channel), hit.unit is not None, hit.score)
@@ -138,12 +139,15 @@ def _named_by_header(places: dict[str, Place], labels: Sequence[str], row: Units
         best = [p for p in hits if p.score == max(h.score for h in hits)]
         best = [p for p in best if p.unit.factor == 1.0] or best
         # Of several measured inputs nobody knows which one acts on the motor.
-        spare = channel in MEASURED_INPUTS or (best[0].score <= 1 and channel not in ("t", "v"))
+        spare = channel in MEASURED_INPUTS or ((best[0].score <= 1 or measured) and channel not in ("t", "v"))
+        names = " and ".join(f"'{p.column}'" for p in best)
+        if len(best) > 1 and measured and channel in CHANNELS and channel not in (*places, *without):
+            notes.append(f"not used: {names}, which look equally like {_MEANING[channel]} ({channel}).")
+            continue
         if channel in places or channel in without or (len(best) > 1 and spare):
             notes += [f"'{p.column}' is not used, '{places['t'].column}' is." for p in best if channel == "t" in places]
             continue
         if len(best) > 1:
-            names = " and ".join(f"'{p.column}'" for p in best)
             speed = " If 'v' is the speed: columns={'v': 'u', 'omega': 'v'}." * (names.lower() == "'u' and 'v'")
             raise DataError(f"{names} look equally like {_MEANING[channel]} ({channel}); say which one "
                             f"is meant, e.g. columns={{'{channel}': '{best[0].column}'}}.{speed}")

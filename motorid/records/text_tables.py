@@ -22,6 +22,8 @@ MOST_COLUMNS = 5000
 _LARGEST = 1e30  # what is larger, or infinite, was not measured
 MISSING = frozenset(["", "nan", "na", "n/a", "null", "none", "-", "--", "---", "?", "missing", "#n/a"])
 _NUMBER = re.compile(r"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|inf)", re.IGNORECASE)
+_PAIR = r"([^\W\d][^:=,;\t]*?)\s*[:=,;\t]\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|nan|inf)(?=[,;\s]|$)"
+_NAMED, _ALL_NAMED = re.compile(_PAIR), re.compile(rf"\s*+(?:{_PAIR}\s*+[,;]?\s*+)++")
 _GROUPS = {".": ",", ",": "."}  # decimal mark to what may stand between thousands
 _SPACES = " '’\u00a0\u2009\u202f"  # may stand there, too
 _GROUPED = {mark: rf"[-+]?[1-9]\d{{0,2}}(?:[{group}{_SPACES}]\d{{3}})+(?:\{mark}\d*)?"
@@ -57,6 +59,7 @@ def parse_table(data: bytes) -> TextTable:
     lines = [line for line in re.split(r"\r\n|\r|\n", text) if line.strip()]
     comments = [line.strip() for line in lines if line.lstrip().startswith(_COMMENT)]
     body = [line for line in lines if not line.lstrip().startswith(_COMMENT)]
+    body = body and _unnamed(body, notes)
     if not body:
         raise DataError("it holds no rows" + (", only comments." if comments else "; the file is empty."))
     cells = len(re.findall(r"[\t;, ]+", body[len(body) // 2]))
@@ -75,6 +78,22 @@ def parse_table(data: bytes) -> TextTable:
     labels, unit_row = _header(body[:first], comments, dialect, width, notes)
     columns, texts = _parse(_rows(body[first:], dialect, len(labels), notes), dialect, labels, notes)
     return TextTable(columns, texts, labels, dict(zip(labels, unit_row, strict=False)), comments, notes)
+
+
+def _unnamed(body: list[str], notes: list[str]) -> list[str]:
+    """Return rows of names and numbers in turn (``t,0.1,speed,3.2`` or ``t:0.1 speed:3.2``) as a table below a header;
+    others as they are."""
+    sample = next((line for line in body[len(body) // 4::max(len(body) // 4, 1)] if _ALL_NAMED.fullmatch(line)), "")
+    if not sample:
+        return body
+    names = [name.strip() for name, _ in _NAMED.findall(sample)]
+    pairs = [_NAMED.findall(line) if _ALL_NAMED.fullmatch(line) else [] for line in body]
+    rows = [";".join(value for _, value in row) for row in pairs if [name.strip() for name, _ in row] == names]
+    if len(names) < 2 or len(rows) <= len(body) / 2:
+        return body
+    if len(rows) < len(body):
+        notes.append(f"left out {counted(len(body) - len(rows), 'line')} without {', '.join(names)}.")
+    return [";".join(unique_labels(names)), *rows]
 
 
 def _is_json(text: str) -> bool:

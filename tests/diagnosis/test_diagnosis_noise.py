@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy
 from battery.excite import P, driven, record
+from lab_records import pair
 
 import motorid as mi
 from motorid.diagnosis.adequacy import adequacy, judge_adequacy
@@ -15,6 +16,7 @@ from motorid.diagnosis.free_forms import Form
 from motorid.diagnosis.misspecification import better_forms, hum_of
 from motorid.diagnosis.model_comparison import node_of
 from motorid.diagnosis.predictive_score import HeldOut
+from motorid.diagnosis.record_versions import without_spikes
 from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.verdict import _noise_feedback, closed_loop_remark, outliers_remark
 from motorid.effects import LIBRARY
@@ -202,3 +204,19 @@ def test_an_angle_that_follows_a_smooth_drive_is_no_closed_loop(lab, plant):
     for volts, said in ((np.full(smooth.n, 3.3), False), (np.sin(9 * smooth.t), True)):
         told = smooth.with_(meta={**smooth.meta, "extra": {"adc_vref": volts}})
         assert ("closed loop" in closed_loop_remark(mi.fit(mi.dc_motor(), told))) is said  # a sensor's own stands still
+
+
+def test_samples_that_stand_out_at_one_angle_of_a_turn_are_no_accident(rng):
+    runs = pair(rng, 1500, channels=("i", "omega", "theta"))
+    for gathered in (True, False):
+        dipped = []
+        for run in runs:
+            turn = run.outputs["theta"] % (2 * np.pi)
+            lacking = (np.diff(turn > 2.0, prepend=False) > 0) & (np.arange(run.n) > 100)  # one sample a turn
+            if not gathered:
+                lacking = rng.permutation(lacking)
+            assert 10 < lacking.sum() < 0.05 * run.n
+            dipped.append(run.with_(outputs={**run.outputs, "omega": run.outputs["omega"] * np.where(lacking, 0.5, 1)}))
+        fit = mi.fit(mi.dc_motor(), dipped)
+        assert (without_spikes(fit) is None) == gathered
+        assert ("They gather at angles of a turn" in outliers_remark(fit)) == gathered

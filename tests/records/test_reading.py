@@ -775,3 +775,20 @@ def test_a_column_in_a_unit_that_its_name_cannot_have_is_told(tmp_path, header):
     assert f"not used: '{header}'; it is named like the current" in notes(run)
     run = read_csv(write(tmp_path, text), columns={"i": header}, units={"i": "0.5 A"})
     assert run.outputs["i"] == pytest.approx(0.5 * np.round(np.sin(np.arange(60)), 4), abs=1e-9)
+
+
+@pytest.mark.parametrize("row", ["t,{t:.3f},PWM,{v},speed,{w}", "t:{t:.3f} PWM:{v} speed:{w}",
+                                 "t = {t:.3f}; PWM = {v}; speed = {w}", "t:{t:.3f},\tPWM:{v},\tspeed:{w}"])
+def test_rows_of_names_and_numbers_in_turn_are_a_table(tmp_path, row):
+    lines = [row.format(t=1e-3 * k, v=k % 7, w=0.5 * k) for k in range(60)]
+    run = read_csv(write(tmp_path, "\n".join([*lines[:30], "reset by watchdog", *lines[30:]])), columns={"v": "PWM"})
+    assert run.outputs["omega"] == pytest.approx(0.5 * np.arange(60))
+    assert run.inputs["v"] == pytest.approx(np.arange(60) % 7)
+    assert "left out 1 line without t, PWM, speed" in notes(run)
+
+
+def test_who_names_a_channel_need_not_tell_others_apart(tmp_path):
+    text = "t_s,u_V,Enc0,Enc1,Enc2\n" + "".join(f"{k},1,{k},{2 * k},{3 * k}\n" for k in range(20))
+    run = read_csv(write(tmp_path, text), columns={"omega": "Enc0"})
+    assert run.channels == ("omega",)
+    assert "not used: 'Enc1' and 'Enc2', which look equally like the angle (theta)" in notes(run)
