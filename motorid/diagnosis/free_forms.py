@@ -243,7 +243,8 @@ def functions_of(form: Form, span: Span) -> list[str]:
         lengths = memories_of(form, span)
         lags = [f"past(z, {_place(length, lengths[0] / 10, lengths[-1] * 10)})" for length in lengths]
         top = f"{max(abs(low), abs(high)):.6g}"
-        slips = [f"(z - {lag})" for lag in lags if form.on == "past omega" and span.finer > 1]
+        ways = float(top) * np.asarray(lengths) if form.on == "past omega" and span.finer > 1 else []
+        slips = [f"(z - drag(z, {_place(w, w / 100, w * 100, 'rad:slip')}))" for w in ways]  # water in a drum
         bent = [f"{lag} * ca.fabs({lag}) / {top}" for lag in (*lags, *slips) if form.bends]
         if form.carrier:
             trips = [f"ca.fmax({lag} / {top} - {_place(level, 0, 1, '1')}, 0)" for lag in lags if form.on == "past heat"
@@ -374,10 +375,12 @@ def past(z: Array, along: Array, length: float, initial: float) -> Array:
     return np.interp(along, even, np.concatenate([[initial], lagged]))
 
 
-STEPS = {  # from the last value to the next: of what plays, is ramped up and falls at once, or jumps up and falls late
+STEPS = {  # from the last value to the next: of what plays, is ramped up and falls at once, jumps up and falls late, or
+    # is dragged along by the square of its slip (both sides feel the same torque)
     "play": lambda last, z, width, dt: min(max(last, z - width), z + width),
     "ramp": lambda last, z, rate, dt: np.sign(z) * min(abs(z), max(last * np.sign(z), 0.0) + rate * dt),
-    "hold": lambda last, z, length, dt: z if abs(z) > abs(last) else z + (last - z) * np.exp(-dt / length)}
+    "hold": lambda last, z, length, dt: z if abs(z) > abs(last) else z + (last - z) * np.exp(-dt / length),
+    "drag": lambda last, z, way, dt: z + (last - z) / (1 + abs(last - z) * dt / way)}
 
 
 def _stepped(kind: str, z: Array, t: Array, place: float, last: float) -> Array:

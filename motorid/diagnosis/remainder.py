@@ -68,16 +68,17 @@ SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V", "load":
 OTHER_PLACES = {"1": "where it sets in, a share of the largest", "V": "half of its play", "A": "half of its play",
                 "rad/s": "how fast it swings, or half of its play", "V/s": "how fast it rises",
                 "1:wave": "how many to the turn", "rad:phase": "its phase", "rad:wide": "half of its width",
-                "rad:edge": "how wide its edges are"}
+                "rad:edge": "how wide its edges are", "rad:slip": "how far it slips until what it drags along follows"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
 CLIPPED = re.compile(r"ca\.fmin\(ca\.fmax\(z, \S+\), \S+\)")
-MEMORY = re.compile(r"((past|play|ramp|hold)\(z, (.*?)\))")
+MEMORY = re.compile(r"((past|play|ramp|hold|drag)\(z, (.*?)\))")
 RATES = {  # of what follows z, with one place
     "past": "(z - {s}) / {p}", "play": "(ca.fmax(z - {p} - {s}, 0) - ca.fmax({s} - z - {p}, 0)) / {step}",
     "ramp": "ca.if_else(z < 0, -1, 1) * (ca.fmin({p}, (ca.fabs(z) - ca.if_else(z < 0, -{s}, {s})) / {step})"
             " + ca.fmax(ca.if_else(z < 0, {s}, -{s}), 0) / {step})",
-    "hold": "(z - {s}) / ca.if_else(ca.fabs(z) > ca.fabs({s}), {sample}, {p})"}
+    "hold": "(z - {s}) / ca.if_else(ca.fabs(z) > ca.fabs({s}), {sample}, {p})",
+    "drag": "(z - {s}) * ca.fabs(z - {s}) / {p}"}
 POSITIVE = "ca.fmax(curve, -0.5) - 0.25 / ca.fmin(curve, -0.5) - 0.5"  # above -1, smooth; from -0.5 on as it is
 CARRIERS = {"": "", "direction": "m.sign(m.omega) * ", "omega": "m.omega * ", "i": "m.i * ", "v": "m.v * "}
 
@@ -271,6 +272,9 @@ class Curve:
             each = product(powers, free_forms.memories_of(part.form, part.span))  # in the order of the functions
             forms = [(f"{base}{power}one lag of {number(length, 2)} {over}", [lags[:, j] for j in (k, *also)])
                      for k, (power, length) in enumerate(each)]
+            slips = ((float(PLACE.findall(f)[0][0]), k) for k, f in enumerate(functions) if "drag(" in f)
+            forms += [(f"the square of the slip against what follows within {number(way, 2)} rad", [lags[:, k]])
+                      for way, k in slips]
             unit = part.unit(self.fit, bare=True)
         return sorted((_closed(text, functions, value, unit) for text, functions in forms), key=lambda f: f[1])
 
