@@ -1300,7 +1300,7 @@ def test_what_repeats_in_another_length_than_a_turn_is_found_with_it():
 @pytest.fixture(scope="module")
 def rubbed():
     """Three runs of a motor with a brake that rubs within a part of each turn, and the noise of its sensors."""
-    rng, t = np.random.default_rng(9), np.arange(1200) * 1e-3
+    rng, t = np.random.default_rng(9), np.arange(700) * 1e-3
 
     @mi.effect(balance="torque")
     def rubbing(m, tau=mi.P(0.2, "N·m", null=0.0)):
@@ -1310,7 +1310,7 @@ def rubbed():
     noise = {"i": 0.02, "omega": 0.5, "theta": 2e-3}
     runs = []
     for _ in range(3):
-        still = mi.Experiment(t, {"v": np.repeat(rng.uniform(-12, 12, 12), 100)}, {c: np.zeros_like(t) for c in noise})
+        still = mi.Experiment(t, {"v": np.repeat(rng.uniform(-12, 12, 7), 100)}, {c: np.zeros_like(t) for c in noise})
         shown = mi.simulate(motor + rubbing, still, initial="rest")[0].outputs
         runs.append(still.with_(outputs={c: shown[c] + s * rng.standard_normal(len(t)) for c, s in noise.items()}))
     return runs, noise
