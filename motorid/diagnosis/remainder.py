@@ -123,6 +123,11 @@ class Part:
         return [functions[k] for k in self.chosen]
 
     @property
+    def counts(self) -> list[int]:
+        """How many places each function has that are fitted."""
+        return [len({m[0] for m in PLACE.finditer(f)}) * self.moved for f in self.functions]
+
+    @property
     def places(self) -> list[tuple[float, float, float, str]]:
         """Where each function bends, sets in or fades on the grid, its limits and unit; none if they stay there."""
         each = (m.groups() for f in self.functions if self.moved for m in {m[0]: m for m in PLACE.finditer(f)}.values())
@@ -560,6 +565,25 @@ def _best(fit: Fit, tried: Iterable[tuple[Curve, Form]], held: HeldOut) -> Grown
         if best is None or best.done or (larger := _better_curve(_further(best), best.predictions, held)) is None:
             break
         best = _revised(larger, held)
+    return best and _slimmed(best, held)
+
+
+def _slimmed(best: Grown, held: HeldOut) -> Grown:
+    """Return a curve without the functions that are within two deviations of nothing, if it predicts as well so."""
+    curve, fitted = best.curve, best.curve.fitted
+    parts, values = list[Part](), list[float]()
+    for part, sizes, places in curve._apart(curve.sizes.items()) if fitted else ():
+        told = [abs(c) > 2 * (fitted.std.get(n) or 0.0) for n, c in sizes]
+        kept = [k for k, known in enumerate(told) if known or part.by_run or not any(told)]
+        ends = np.cumsum([0, *part.counts])
+        parts.append(replace(part, chosen=tuple(part.chosen[k] for k in kept)))
+        values += [sizes[k][1] for k in kept] + [c for k in kept for _, c in places[ends[k] : ends[k + 1]]]
+    if len(values) < len(curve.values) and fitted:
+        with contextlib.suppress(*FAILURES, OutOfTime):
+            slim = replace(curve, parts=tuple(parts), values=tuple(values))
+            if (done := slim.refitted(fitted, slim.sizes)) and done.fitted:
+                predicted = held.predictions(done.fitted)
+                return best if compare(predicted, best.predictions).worth_it else Grown(best.gained, predicted, done)
     return best
 
 
