@@ -28,9 +28,9 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
            meta: Mapping[str, object] | None = None) -> Recording:
     """Record one run from a bench that speaks `motorid.acquire.protocol`, into a CSV that `read_runs` opens.
 
-    Every valid line is in the file within a tenth of a second and on the disk within one; lost samples are
-    rows whose measured cells are empty. The device itself runs the excitation and enforces the limits; they
-    are checked here as well, before anything moves. **Keep clear of the shaft and have a switch at hand.**
+    Every valid line is in the file within a tenth of a second and on the disk within one; lost samples are rows whose
+    measured cells are empty. The device runs the excitation and enforces the limits, which are checked here as well
+    before anything moves. **Keep clear of the shaft and have a switch at hand.**
 
     Parameters
     ----------
@@ -41,8 +41,7 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
     baud : int
         Bits per second; boards with native USB ignore it.
     excite : str or Program, optional
-        What to apply, e.g. ``"rest:0.2,step:6:0.5,coast:1"`` or ``"standard"``; see
-        `motorid.acquire.excitation`. By default 0 V.
+        E.g. ``"rest:0.2,step:6:0.5,coast:1"`` or ``"standard"``, see `motorid.acquire.excitation`; default: 0 V.
     duration : float, optional
         Stop after so many s.
     limit_voltage, limit_current : float

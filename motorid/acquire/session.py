@@ -213,39 +213,18 @@ class Progress:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recording(Shown):
-    """The outcome of `record`; the data are in the file.
-
-    Attributes
-    ----------
-    header : Header
-        Of the device, as calibrated.
-    ended : str
-        ``done``, ``duration``, ``interrupted``, ``limit``, ``emergency``, ``overrun``, ``watchdog``,
-        ``unplugged``, ``silent``, ``restarted`` or ``disk``.
-    detail : str
-        What the system said, for the last ones.
-    received, lost : int
-        Valid samples, and samples that the device made and that never came.
-    tail_known : bool
-        Whether the device told how many samples it made, so that `lost` covers the end of the run too.
-    seconds : float
-        Length of the run, device time.
-    bad : mapping of str to int
-        Lines (and bytes) that were not valid or not usable, by reason. They explain losses, they are not added to them.
-    clipped : mapping of str to int
-        Samples at the end of a converter's range, by channel.
-    """
+    """The outcome of `record`; the data are in the file."""
 
     path: Path
-    header: Header
-    ended: str
-    detail: str
-    received: int
-    lost: int
-    tail_known: bool
-    seconds: float
-    bad: Mapping[str, int]
-    clipped: Mapping[str, int]
+    header: Header  # of the device, as calibrated
+    ended: str  # why: a key of `SENTENCES`
+    detail: str  # what the system said, where it did
+    received: int  # valid samples
+    lost: int  # samples that the device made and that never came
+    tail_known: bool  # whether the device told how many it made, so that `lost` covers the end of the run too
+    seconds: float  # length of the run, device time
+    bad: Mapping[str, int]  # lines and bytes not valid or not usable, by reason: they explain losses, and add none
+    clipped: Mapping[str, int]  # samples at the end of a converter's range, by channel
 
     @property
     def complete(self) -> bool:

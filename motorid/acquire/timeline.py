@@ -24,10 +24,9 @@ class _Mark(NamedTuple):
 class Timeline:
     """Places samples on the time axis of a run and counts what is lost.
 
-    A gap is the step of the counter. Where the counter may have wrapped more than once the timer decides, and where the
-    timer may have wrapped too, the clock of the computer. A sample whose counter and time contradict each other is
-    believed only when the next one agrees with it, so that a damaged frame that happens to have a valid CRC does not
-    open a gap. `counter` and `time` are those of the first sample, `host` the computer's clock (s) then.
+    A gap is a step of the counter; where that may have wrapped more than once the timer decides, and where the timer
+    may have, too, the computer's clock. A sample whose counter and time contradict each other is believed only when the
+    next one agrees: a damaged frame may have a valid CRC. `counter`, `time` and `host` (clock, s): at the first sample.
     """
 
     def __init__(self, header: Header, counter: int, time: int, host: float = 0.0) -> None:
