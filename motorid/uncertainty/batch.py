@@ -58,27 +58,15 @@ class Outlier:
 class Batch:
     """What came of many motors.
 
-    Attributes
-    ----------
-    rows : tuple of dict
-        One per motor, in the order given: ``motor``, ``status`` (``"converged"``, … or ``"failed"``),
-        ``message``, ``flags``, ``seconds``, per parameter its value and ``<name>_std`` (None: not
-        determined), ``nrmse_<channel>``, ``chi2``, ``dof``.
-    parameters : tuple of str
-        The free ones.
-    positive : frozenset of str
-        Those compared on the logarithmic scale.
-    interrupted : str
-        Empty, or how far it came.
-    units : dict of str to str
-        Of the parameters.
+    A row holds ``motor``, ``status`` (``"converged"``, … or ``"failed"``), ``message``, ``flags``, ``seconds``, per
+    parameter its value and ``<name>_std`` (None: not determined), ``nrmse_<channel>``, ``chi2`` and ``dof``.
     """
 
-    rows: tuple[dict[str, Any], ...]
-    parameters: tuple[str, ...]
-    positive: frozenset[str]
-    interrupted: str = ""
-    units: Mapping[str, str] = field(default_factory=dict)
+    rows: tuple[dict[str, Any], ...]  # one per motor, in the order given
+    parameters: tuple[str, ...]  # the free ones
+    positive: frozenset[str]  # those compared on the logarithmic scale
+    interrupted: str = ""  # or how far it came
+    units: Mapping[str, str] = field(default_factory=dict)  # of the parameters
 
     @cached_property
     def table(self) -> Any:
@@ -147,8 +135,7 @@ def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path
     motors : mapping of str to records
         Per motor its runs, or where they are: a path, a pattern, several of these; read by the worker.
     journal : path, optional
-        Results are added to this file as they come; what is there for the same model, options and records is
-        not done again. So an interrupted batch continues where it was.
+        Results go to this file as they come; what it holds for the same model, options and records is not done again.
     map : callable, optional
         Anything with the signature of `map`; a task is one motor, or a few of many.
     reading : mapping, optional

@@ -36,32 +36,20 @@ EXACTLY = replace(SOLVER, ftol=1e-10)  # what priors say is a small part of the 
 class Bootstrap(Printed):
     """Refits to resampled records.
 
-    Attributes
-    ----------
-    reference : ndarray, shape (k,)
-        The fit's values.
-    samples : ndarray, shape (n, k)
-    limited : dict of str to float
-        Share of the refits that ended at a limit of the parameter.
-    status : mapping of str to str
-        As in `Covariance`. Refits start from the fit, so what the data do not determine hardly moves: their
-        spread says nothing then, and neither a standard deviation nor an interval is given.
-    block : int
-        Length of the blocks, in samples.
-    interrupted : str
-        Empty, or how far it came.
+    They start from the fit, so what the data do not determine hardly moves: its spread says nothing, and neither a
+    standard deviation nor an interval is given.
     """
 
     kind: str
     names: tuple[str, ...]
-    reference: Array
-    samples: Array
+    reference: Array  # (k,), the fit's values
+    samples: Array  # (n, k)
     failures: tuple[Failure, ...]
-    limited: Mapping[str, float]
+    limited: Mapping[str, float]  # share of the refits that ended at a limit of the parameter
     units: tuple[str, ...]
-    status: Mapping[str, str]
-    block: int = 0
-    interrupted: str = ""
+    status: Mapping[str, str]  # as in `Covariance`
+    block: int = 0  # length of the blocks, in samples
+    interrupted: str = ""  # or how far it came
 
     @property
     def std(self) -> dict[str, float | None]:

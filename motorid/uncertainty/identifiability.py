@@ -42,60 +42,31 @@ EASY = ("R", "K", "g", "L", "b", "J")  # in the order in which they are usually 
 
 @dataclass(frozen=True)
 class WeakDirection:
-    """A change of parameters that shows little in the data.
+    """A change of parameters that shows little in the data."""
 
-    Attributes
-    ----------
-    parameters : dict of str to float
-        Relative changes (in units of the natural size where a parameter may be zero), the largest being 1.
-    seen : float
-        What this change does to all outputs together, in units of the noise.
-    """
-
-    parameters: Mapping[str, float]
-    seen: float
+    parameters: Mapping[str, float]  # relative changes (of the natural size where one may be zero), the largest being 1
+    seen: float  # what a step of 10 % does to all outputs together, in units of the noise
     text: str
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identifiability(Printed):
-    """What records can tell about parameters, at one point.
-
-    Attributes
-    ----------
-    values, sizes : ndarray, shape (k,)
-        Parameters and what a relative change of one means: the value, or the natural size where it may be zero.
-    t : tuple of ndarray
-        Per run, s.
-    sensitivities : tuple of dict of str to ndarray (N, k)
-        Per run and channel: change over the channel's RMS per relative change of a parameter.
-    singular_values : ndarray, shape (k,)
-        Of the stacked matrix, whitened by the noise, initial states projected out.
-    directions : ndarray, shape (k, k)
-        Rows: right singular vectors.
-    structural_rank : int
-        Largest rank at random points: what any such experiment without noise determines.
-    combinations : tuple of str
-        Products that are determined although their factors are not, e.g. ``"R·J"``.
-    remedies : tuple of str
-        What to fix or to measure for full rank.
-    fitted_std : mapping of str to float or None, optional
-        Standard deviations of the fit, where there is one.
-    """
+    """What records can tell about parameters, at one point."""
 
     names: tuple[str, ...]
-    values: Array
-    sizes: Array
+    values: Array  # (k,), parameters
+    sizes: Array  # (k,), what a relative change of one means: the value, or the natural size where it may be zero
     units: tuple[str, ...]
-    t: tuple[Array, ...]
+    t: tuple[Array, ...]  # per run (N,), s
+    # Per run and channel (N, k): change over the channel's RMS per relative change of a parameter.
     sensitivities: tuple[Mapping[str, Array], ...]
-    singular_values: Array
-    directions: Array
-    structural_rank: int
+    singular_values: Array  # (k,), of the stacked matrix, whitened by the noise, initial states projected out
+    directions: Array  # (k, k), rows: right singular vectors
+    structural_rank: int  # largest rank at random points: what any such experiment without noise determines
     weak: tuple[WeakDirection, ...]
-    combinations: tuple[str, ...]
-    remedies: tuple[str, ...]
-    fitted_std: Mapping[str, float | None] | None = None
+    combinations: tuple[str, ...]  # products that are determined although their factors are not, e.g. "R·J"
+    remedies: tuple[str, ...]  # what to fix or to measure for full rank
+    fitted_std: Mapping[str, float | None] | None = None  # standard deviations of the fit, where there is one
 
     @property
     def rank(self) -> int:

@@ -120,28 +120,14 @@ class StartResult:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Multistart(Printed):
-    """Many fits of one problem from random starts.
+    """Many fits of one problem from random starts."""
 
-    Attributes
-    ----------
-    reference : Fit
-        The fit around which the starts were drawn.
-    results : tuple of StartResult or Failure
-        In the order of drawing.
-    spread : float
-        Every start is off by up to this factor in each free parameter.
-    guess : bool
-        Whether the automatic first guess was allowed to take the start's place.
-    interrupted : str
-        Empty, or how far it came.
-    """
-
-    reference: Fit
-    results: tuple[StartResult | Failure, ...]
-    spread: float
-    guess: bool
+    reference: Fit  # around which the starts were drawn
+    results: tuple[StartResult | Failure, ...]  # in the order of drawing
+    spread: float  # every start is off by up to this factor in each free parameter
+    guess: bool  # whether the automatic first guess was allowed to take the start's place
     seconds: float
-    interrupted: str = ""
+    interrupted: str = ""  # or how far it came
 
     @cached_property
     def best(self) -> StartResult | None:
@@ -151,11 +137,8 @@ class Multistart(Printed):
 
     @cached_property
     def kinds(self) -> tuple[str, ...]:
-        """Per start: ``"good"``, ``"poor"`` or ``"failed"``.
-
-        Good: the cost is at most 0.1 % above the best, and every parameter that the data determine is
-        within half its standard deviation of the best. Failed: no result, or a solver that gave up.
-        """
+        """Per start: ``"good"`` (the cost is at most 0.1 % above the best, every parameter that the data determine
+        within half its standard deviation of the best), ``"poor"``, or ``"failed"`` (without a finite cost)."""
         return tuple(self._kind(e) for e in self.results)
 
     def _kind(self, end: StartResult | Failure) -> str:
@@ -171,8 +154,8 @@ class Multistart(Printed):
         periodic = self.reference.problem.model.parameters[name].periodic
         return (a - b + np.pi) % (2 * np.pi) - np.pi if periodic else a - b
 
-    def _ends(self, *kinds: str) -> list[StartResult]:
-        return [e for e, k in zip(self.results, self.kinds, strict=True) if k in kinds and isinstance(e, StartResult)]
+    def _ends(self, kind: str) -> list[StartResult]:
+        return [e for e, k in zip(self.results, self.kinds, strict=True) if k == kind and isinstance(e, StartResult)]
 
     good = property(lambda self: self.kinds.count("good"), doc="Number of good fits.")
     poor = property(lambda self: self.kinds.count("poor"), doc="Number of fits that ended elsewhere.")
@@ -197,19 +180,15 @@ class Multistart(Printed):
     def _lowest(self) -> StartResult | Fit:
         return self.best or self.reference
 
-    def _places(self, *kinds: str) -> list[list[StartResult]]:
-        """Return the ends of these kinds by place, the lowest cost first."""
-        places: list[list[StartResult]] = []
-        for end in sorted(self._ends(*kinds), key=lambda e: e.cost):
-            home = next((p for p in places if self._same_place(p[0], end)), None)
-            places.append([end]) if home is None else home.append(end)
-        return places
-
     @property
     def elsewhere(self) -> str:
         """Where most others ended: ``2 at b = 1.3·10⁻³ N·m·s/rad (3.1 times the squared error)``; else empty."""
         best, pars = self._lowest.values, self.reference.model.parameters
-        places = sorted(self._places("poor"), key=len, reverse=True)
+        places: list[list[StartResult]] = []  # each with its ends, the lowest cost first
+        for e in sorted(self._ends("poor"), key=lambda e: e.cost):
+            home = next((p for p in places if self._same_place(p[0], e)), None)
+            places.append([e]) if home is None else home.append(e)
+        places.sort(key=len, reverse=True)
         told = []
         for place in places[:PLACES]:
             end = place[0].values

@@ -34,29 +34,15 @@ SOLVER = LevenbergMarquardt(max_iterations=60, ftol=1e-8, xtol=1e-8)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Profile(Printed):
-    """The profile of one parameter.
-
-    Attributes
-    ----------
-    value : float
-        The fit's.
-    values : ndarray, shape (m,)
-        Where it was fixed, increasing.
-    rise : ndarray, shape (m,)
-        Rise of twice the cost over that of the fit, in units of the variance; compared with t².
-    others : dict of str to ndarray (m,)
-        How the other parameters followed.
-    dof : float
-        Effective degrees of freedom.
-    """
+    """The profile of one parameter."""
 
     name: str
     unit: str
-    value: float
-    values: Array
-    rise: Array
-    others: dict[str, Array]
-    dof: float
+    value: float  # the fit's
+    values: Array  # (m,), where it was fixed, increasing
+    rise: Array  # (m,), of twice the cost over that of the fit, in units of the variance; compared with t²
+    others: dict[str, Array]  # (m,) each, how the other parameters followed
+    dof: float  # effective degrees of freedom
     positive: bool
 
     @property
