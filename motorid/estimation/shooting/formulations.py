@@ -29,24 +29,13 @@ NONE = "–"
 
 @dataclass(frozen=True, eq=False)
 class Formulation:
-    """One column of the comparison.
+    """One column of the comparison."""
 
-    Attributes
-    ----------
-    name : {"plain", "penalty", "hard"}
-    violations : dict of str to float
-        Largest violation of each constraint, in the unit that its name ends with.
-    steady_residual : float or None
-        Largest balance left over at the measured steady state, relative.
-    multipliers : tuple of Multiplier
-        Of the hard formulation.
-    """
-
-    name: str
+    name: str  # "plain", "penalty" or "hard"
     result: Fit | Failure
-    violations: Mapping[str, float]
-    steady_residual: float | None
-    multipliers: tuple[Multiplier, ...]
+    violations: Mapping[str, float]  # largest of each constraint, in the unit that its name ends with
+    steady_residual: float | None  # largest balance left over at the measured steady state, relative
+    multipliers: tuple[Multiplier, ...]  # of the hard formulation
 
     @property
     def fit(self) -> Fit | None:
@@ -66,18 +55,12 @@ class PathPoint:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Formulations(Shown):
-    """Plain, penalty and hard side by side, and the walk of the penalty solution.
-
-    Attributes
-    ----------
-    path : tuple of PathPoint
-        Penalties on what lies beyond the limits, weights as in the plain fit, from light to heavy.
-    """
+    """Plain, penalty and hard side by side, and the walk of the penalty solution."""
 
     plain: Formulation
     penalty: Formulation
     hard: Formulation
-    path: tuple[PathPoint, ...]
+    path: tuple[PathPoint, ...]  # penalties on what lies beyond the limits, weights as in the plain fit, light to heavy
 
     @property
     def all(self) -> tuple[Formulation, ...]:

@@ -1,8 +1,7 @@
 """Multiple shooting: the fit as a nonlinear program, with true constraints, or with process noise.
 
-The same discrete step as in the least-squares fit. States at nodes are unknowns, so a poor start or a drifting
-record does no harm: each short interval begins near the data. At the solution the intervals join, unless
-process noise is allowed; then the gaps at the nodes show where the model fails.
+States at nodes are unknowns, so a poor start or a drifting record does no harm: each short interval begins near the
+data. At the solution the intervals join, unless process noise is allowed: then their gaps show where the model fails.
 """
 
 from __future__ import annotations
@@ -94,8 +93,7 @@ class MultipleShooting:
         UsageError
             A constraint does not go with the model.
         FitError
-            The constraints contradict one another or the records; the message names them. Or the model cannot
-            be simulated at the start.
+            The constraints that it names contradict one another or the records, or the start cannot be simulated.
         """
         began = time.perf_counter()
         for c in (*problem.constraints, *problem.penalties):
@@ -124,7 +122,6 @@ class MultipleShooting:
 
     def _from_poor_values(self, problem: Problem) -> Array:
         """Return values that a fit finds whose intervals join loosely, then tightly, from poor ones."""
-        # With short intervals that need not join.
         every, size = LOOSE
         mesh = Mesh(problem.tuned(noise_factors=_least_noise(problem)), every)
         step = float(np.median([run.experiment.dt for run in problem.runs]))

@@ -129,25 +129,13 @@ def _with_multipliers(done: Solved) -> list[tuple[str, Part, Array, Array]]:
 
 @dataclass(frozen=True)
 class Multiplier:
-    """One constraint at the solution, or one row of it.
+    """One constraint at the solution, or one row of it."""
 
-    Attributes
-    ----------
-    name : str
-        The constraint's.
-    label : str
-        Which row, where and when; of a sum over rows: how many are active.
-    value : float
-        −d cost/d limit, cost = ½rᵀr, per `unit`: by how much the cost falls when the limit gives way by one unit.
-    active : int
-        Rows that stand at their limit.
-    """
-
-    name: str
-    label: str
-    value: float
+    name: str  # the constraint's
+    label: str  # which row, where and when; of a sum over rows: how many are active
+    value: float  # −d cost/d limit, cost = ½rᵀr: by how much the cost falls when the limit gives way by one `unit`
     unit: str
-    active: int
+    active: int  # rows that stand at their limit
 
     @property
     def text(self) -> str:
