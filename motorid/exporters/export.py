@@ -39,19 +39,10 @@ MOSTLY_NOISE = "this fit is of records that are mostly noise: its values mean li
 
 @dataclass(frozen=True, eq=False)
 class Exported:
-    """A ``.casadi`` file read back.
+    """A ``.casadi`` file read back."""
 
-    Attributes
-    ----------
-    functions : dict of str to casadi.Function
-        ``rhs``, ``outputs``, ``initial``, ``step``, ``parameters``; per record of the fit ``record_k`` and
-        ``simulate_k``. See `export`.
-    info : dict
-        What ``fit --json`` holds, with covariance, fingerprints of the records and versions.
-    """
-
-    functions: Mapping[str, ca.Function]
-    info: Mapping[str, Any]
+    functions: Mapping[str, ca.Function]  # by name, see `motorid.exporters.casadi_file.functions_of`
+    info: Mapping[str, Any]  # what ``fit --json`` holds, with covariance, fingerprints of the records and versions
 
     @property
     def values(self) -> dict[str, float]:
