@@ -64,18 +64,8 @@ def explore(fit: Fit, *, effects: Iterable[Effect | str] | None = None) -> Explo
 class Explorer:
     """What `explore` shows. Everything that the mouse can do is a method, too.
 
-    Attributes
-    ----------
-    fit : Fit
-        The last one: that given, or that of the last refit.
-    model : Model
-        As ticked and set at present.
-    evaluation : Evaluation
-        Errors of `model` on the records.
-    message : str
-        Why the last action could not be done, or what it did.
-    widget : ipywidgets.Widget
-        The controls and the figure.
+    `fit` is the one given, or the last refit; `model` is as ticked and set at present, `evaluation` its errors on the
+    records; `message` says what the last action did, or why it could not; `widget` is the controls and the figure.
     """
 
     def __init__(self, start: Fit, effects: Sequence[Effect]) -> None:
