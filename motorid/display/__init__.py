@@ -1,4 +1,1 @@
-"""How results show themselves: `numbers` for people, tables and `cards` as text and as HTML.
-
-Knows nothing of motors. Entry: `Shown` in `cards`, the base of every result, which writes its own card.
-"""
+"""How results show themselves: `numbers` for people, `cards` with tables as text and HTML; knows nothing of motors."""
