@@ -37,8 +37,7 @@ class Parameter:
     null : float or None
         Value at which the effect vanishes; None for shape parameters (a Stribeck speed, an angle).
     grid : tuple of float
-        For shape parameters: where to start, as multiples of the natural size of `unit` in the data
-        (or absolute values for dimensionless parameters).
+        For shape parameters: where to start, in natural sizes of `unit` in the data (dimensionless: absolute).
     periodic : bool
         A phase angle: starts are found from its sine and cosine part together.
     order : bool
@@ -52,8 +51,7 @@ class Parameter:
     given : bool
         Set by the user; then no first guess replaces it.
     at_least : str
-        Name of a parameter that this one cannot physically fall below (breakaway friction, Coulomb friction);
-        checked after a fit, by `diagnose`.
+        Name of the parameter that this one cannot fall below (breakaway friction, Coulomb's); `diagnose` checks it.
 
     Examples
     --------

@@ -56,10 +56,8 @@ class Equations:
         states, placeholders = self.__dict__.get("states", {}), self.__dict__.get("placeholders", {})
         if name == "theta":
             return self.inputs["theta_in"] + self.zero if "theta_in" in self.inputs else self.angle_state()
-        if name in states:
-            return states[name]
-        if name in placeholders:
-            return placeholders[name]
+        if name in (known := placeholders | states):
+            return known[name]
         if name.startswith("__"):
             raise AttributeError(name)
         raise self._unknown(name, [*states, "theta", *placeholders, "voltage", "torque"])
