@@ -26,6 +26,7 @@ from motorid.problem.simulate import Simulation, moving
 
 FINE = 60  # bins of a mean that is drawn as a curve
 LOWEST_GAIN = -0.12  # drawn; what lies below is shown by an arrow
+LAGS = 60  # of a correlation
 _COLOUR = {"voltage": style.PALETTE["purple"], "torque": style.PALETTE["blue"]}
 
 
@@ -277,9 +278,6 @@ def plot_design(design: Design) -> np.ndarray:
         ax.set(ylabel=style.axis_label(channel), xlabel=style.axis_label("t") if ax is axes[-1] else "")
     axes[0].figure.legend(*axes[1].get_legend_handles_labels(), loc="outside upper right", ncols=4)
     return axes
-
-
-LAGS = 60
 
 
 @style.styled

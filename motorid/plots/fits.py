@@ -25,6 +25,7 @@ from motorid.problem.simulate import Simulation, judge
 from motorid.records.experiment import Experiment
 
 COLUMNS = 3  # runs side by side at most: more would be unreadable
+NEAR = 0.5  # of a limit of the current: what is worth a closer look
 
 
 @style.styled
@@ -305,9 +306,6 @@ def _fits(results: Sequence[Any]) -> list[Any]:
     if not fits:
         raise UsageError("plot_parameters needs at least one fit: mi.plot_parameters(fit, better).")
     return fits
-
-
-NEAR = 0.5  # of the limit: what is worth a closer look
 
 
 @style.styled

@@ -70,9 +70,8 @@ def plot_singular_values(result: Identifiability) -> np.ndarray:
 def plot_profile(result: Profile | Mapping[str, Profile] | Intervals) -> np.ndarray:
     """Draw how the error rises as a parameter is fixed away from its value, all others refitted.
 
-    Where the curve crosses the dashed line the interval of 95 % ends. An even valley is what the covariance
-    assumes; a curve that never reaches the line says that the data set no limit there. Of `Intervals` the
-    covariance's and the bootstrap's are drawn below the curve.
+    The interval of 95 % ends where the curve crosses the dashed line; where it never does, the data set no limit. The
+    covariance assumes an even valley. Of `Intervals` the covariance's and the bootstrap's are drawn below the curve.
 
     Returns
     -------
