@@ -3,13 +3,12 @@
 The damped step solves ``min ‖J d + r‖² + λ‖D d‖²`` by a QR factorisation of J (never JᵀJ); λ = 0 is Gauss-Newton's. A
 residual that cannot be computed shortens the step. Variables at a bound with an outward gradient are held for the step.
 
-Why it arrives from far away. On the logarithmic scale a positive parameter that runs to zero or to infinity loses its
-influence, and the plateau behind it looks like a minimum. The usual D, column norms of J (Moré, 1978), hardly brakes
-it: a first step that is right for the others throws it there. Here D = ‖r‖: a change by a factor of e costs λ times the
-present misfit, so parameters that the misfit does not ask for stay where they are until their turn comes. Damping in
-proportion to ‖r‖² makes the method converge globally and quadratically even where J is singular (Yamashita & Fukushima,
-Computing Suppl. 15, 2001; Fan & Yuan, Computing 74, 2005). λ follows the gain ratio (Nielsen, IMM-REP-1999-05). Of 100
-starts within a factor of ten 99 end in the optimum, 75 to 94 with the column norms; see `motorid.estimation.restarts`.
+On the logarithmic scale a parameter that runs to zero or to infinity loses its influence, and the plateau behind it
+looks like a minimum. The usual D, column norms of J (Moré, 1978), hardly brakes it. Here D = ‖r‖: a change by a factor
+of e costs λ times the present misfit, so a parameter that the misfit does not ask for stays until its turn comes.
+Damping by ‖r‖² converges globally, and quadratically even where J is singular (Yamashita & Fukushima, Computing Suppl.
+15, 2001; Fan & Yuan, Computing 74, 2005). λ follows the gain ratio (Nielsen, IMM-REP-1999-05). Of 100 starts within a
+factor of ten 99 end in the optimum, 75 to 94 with the column norms; see `motorid.estimation.restarts`.
 """
 
 from __future__ import annotations
@@ -114,6 +113,8 @@ ENDS = {  # status and message
                        "identifiability()")}
 PROMISED = 1e-3  # share of the cost that the undamped step may promise at an end without a step
 SLACK = 1.0  # λ above which a small gain does not mean the end: the step was short, not the way
+MANY = 24  # unknowns, of which some are likely to act on a few rows only: the first states of many runs
+ROWS = 256  # that are reduced together then, to a triangle of the unknowns that act there
 
 
 def levenberg_marquardt(residual: Callable[[Array], Array], both: Callable[[Array], tuple[Array, Array]], q0: Array,
@@ -209,10 +210,6 @@ class _Search:
         except SimulationError:  # slopes may overflow where outputs do not
             self.lam = 100 * max(self.lam, 1e-3)
         return ""
-
-
-MANY = 24  # unknowns, of which some are likely to act on a few rows only: the first states of many runs
-ROWS = 256  # that are reduced together then, to a triangle of the unknowns that act there
 
 
 def _reduce(jac: Array, r: Array) -> tuple[Array, Array]:
