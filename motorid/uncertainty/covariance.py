@@ -121,8 +121,7 @@ def covariance(fit: Fit, *, method: str = "coloured") -> Covariance:
     """
     known, unknown = checked(fit, "covariance").certainty(method), fit.problem.unknown
     lost = np.array([s != "determined" for s in known.status], bool)
-    matrix = known.matrix.copy()
-    matrix[lost], matrix[:, lost] = np.nan, np.nan
+    matrix = np.where(lost | lost[:, None], np.nan, known.matrix)
     names = tuple(p.name for p in unknown)
     return Covariance(names, fit.problem.scaling.physical(fit.q), matrix, dict(zip(names, known.status, strict=True)),
                       tuple(p.positive for p in unknown), method, known.dof, known.colours,
