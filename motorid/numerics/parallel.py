@@ -266,10 +266,9 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False, at_m
 
     The bar stands on standard error and vanishes at the end. There is none if `quiet`, or if nobody looks (a pipe, a
     log file, a worker process). Inside another one it only says what that one is at, so any function may use it. With a
-    `total` of tasks it shows the time left, at the pace so far, which may be less if the total is `at_most`. What is
-    `short`, often over in a second, has no bar before in a notebook, where a bar leaves an empty output. It yields
-    ``advance(n=1, at_work="", done=None, total=None)``: `at_work` takes the place of `text`; `done` is how many tasks
-    are, parts of one included.
+    `total` of tasks it shows the time left, which may be less if the total is `at_most`. What is `short` has no bar in
+    its first second in a notebook, where a bar leaves an empty output. It yields ``advance(n=1, at_work="", done=None,
+    total=None)``: `at_work` takes the place of `text`; `done` is how many tasks are, parts of one included.
 
     Examples
     --------
