@@ -110,7 +110,7 @@ def bootstrap(fit: Fit, *, kind: str = "blocks", n: int = 200, block: int | None
         ``"blocks"``: model plus blocks of its residuals, which keeps their correlation in time and between channels;
         a little too narrow where that is strong: on two runs of 1.2 s with a correlation of 0.9 between samples its
         95 % covered the truth in 91 %, those of `covariance` in 94 %. ``"parametric"``: model plus noise of the
-        autoregression fitted to the residuals. ``"runs"``: whole runs with replacement, whose differences count, too.
+        autoregression fitted to the residuals. ``"runs"``: whole runs drawn with replacement, whose differences count.
     n : int
         Number of refits.
     block : int, optional
