@@ -330,6 +330,19 @@ class Curve:
         curve = replace(self, parts=(*self.parts[:k], *self.parts[k + 1:]), values=tuple(chain.from_iterable(kept)))
         return curve.refitted(self.fitted or self.fit, curve.sizes)
 
+    def slimmed(self) -> Curve | None:
+        """Return the curve without the functions that are within two deviations of nothing, fitted anew; None where
+        there are none of these, or that fails."""
+        parts, values, std = list[Part](), list[float](), self.fitted.std if self.fitted else {}
+        for part, sizes, places in self._apart(self.sizes.items()):
+            told = [abs(c) > 2 * (std.get(n) or 0.0) for n, c in sizes]
+            kept = [k for k, known in enumerate(told) if known or part.by_run or not any(told)]
+            ends = np.cumsum([0, *part.counts])
+            parts.append(replace(part, chosen=tuple(part.chosen[k] for k in kept)))
+            values += [sizes[k][1] for k in kept] + [c for k in kept for _, c in places[ends[k] : ends[k + 1]]]
+        slim = replace(self, parts=tuple(parts), values=tuple(values))
+        return slim.refitted(self.fitted or self.fit, slim.sizes) if len(values) < len(self.values) else None
+
     def refitted(self, last: Fit, *starts: Mapping[str, float]) -> Curve | None:
         """Return the curve fitted with the model, from `starts` beside the `last` values or not; None if that fails."""
         done = refit(last, self.fit.model + self.effect, [{**w, **s} for s in starts for w in (last.values, {})])
@@ -569,21 +582,12 @@ def _best(fit: Fit, tried: Iterable[tuple[Curve, Form]], held: HeldOut) -> Grown
 
 
 def _slimmed(best: Grown, held: HeldOut) -> Grown:
-    """Return a curve without the functions that are within two deviations of nothing, if it predicts as well so."""
-    curve, fitted = best.curve, best.curve.fitted
-    parts, values = list[Part](), list[float]()
-    for part, sizes, places in curve._apart(curve.sizes.items()) if fitted else ():
-        told = [abs(c) > 2 * (fitted.std.get(n) or 0.0) for n, c in sizes]
-        kept = [k for k, known in enumerate(told) if known or part.by_run or not any(told)]
-        ends = np.cumsum([0, *part.counts])
-        parts.append(replace(part, chosen=tuple(part.chosen[k] for k in kept)))
-        values += [sizes[k][1] for k in kept] + [c for k in kept for _, c in places[ends[k] : ends[k + 1]]]
-    if len(values) < len(curve.values) and fitted:
-        with contextlib.suppress(*FAILURES, OutOfTime):
-            slim = replace(curve, parts=tuple(parts), values=tuple(values))
-            if (done := slim.refitted(fitted, slim.sizes)) and done.fitted:
-                predicted = held.predictions(done.fitted)
-                return best if compare(predicted, best.predictions).worth_it else Grown(best.gained, predicted, done)
+    """Return a curve without functions that came to nothing, if it predicts as well so."""
+    with contextlib.suppress(*FAILURES, OutOfTime):
+        slim = best.curve.slimmed()
+        if slim and slim.fitted:
+            predicted = held.predictions(slim.fitted)
+            return best if compare(predicted, best.predictions).worth_it else Grown(best.gained, predicted, slim)
     return best
 
 

@@ -28,10 +28,9 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     """Make a valid run of the columns of a file: numbers with NaN where missing, and `texts`, which may be dates.
     `notes` and those made here end up in ``meta["notes"]``; a recording was resumed at ``meta["parts"]``, s."""
     said = [*notes, *layout.notes]
-    columns = {n: np.where(np.isnan(c), np.nan, c) for n, c in columns.items()}  # one of a damaged file may signal
     places = dict(layout.places)
+    columns = _without_marks(columns, {p.column for c, p in places.items() if c != "t"} - {*texts}, said)
     t = _time(columns, texts, places.pop("t"), said)
-    _without_marks(columns, {p.column for p in places.values()} - {*texts}, said)
     values = {c: _channel(columns, texts, place, c) for c, place in places.items()}
     rows, t, begun = _rows_in_order(t, layout.places["t"].column, said)
     first = _first_input(values["v"][rows], places["v"].column, said)
@@ -73,15 +72,17 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
         raise DataError(str(error).removeprefix(f"{name}: ")) from None
 
 
-def _without_marks(columns: dict[str, Array], used: Iterable[str], said: list[str]) -> None:
+def _without_marks(columns: Mapping[str, Array], measured: Iterable[str], said: list[str]) -> dict[str, Array]:
     """Count as missing what loggers write where nothing was measured: a number of `_MARKS`, far from all others."""
-    for name in sorted(used):
+    columns = {n: np.where(np.isnan(c), np.nan, c) for n, c in columns.items()}  # one of a damaged file may signal
+    for name in sorted(measured):
         marked = np.isin(y := columns[name], _MARKS)
         rest = y[~marked & np.isfinite(y)]
         for mark in np.unique(y[marked]) if rest.size else ():
             if np.abs(rest - mark).min() > np.ptp(rest):
                 y[y == mark] = np.nan
                 said.append(f"'{name}' holds {mark:g}, far from all other values: taken for a missing sample.")
+    return columns
 
 
 def _going_on(measured: Mapping[str, Array], t: Array, column: str, said: list[str]) -> Array:

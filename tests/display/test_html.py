@@ -37,7 +37,7 @@ def fake_fit():
         {"R": 1.38012, "L": 1.72e-3, "K": 0.0462, "b": 6.5e-5, "J": 2.35e-5, "tau_c": 8.01e-3}
     )
     std = {"R": 0.0041, "L": None, "K": 1.2e-5, "b": 3e-7, "J": 0.0, "tau_c": 6e-6, "sgn_width": 0.0}
-    run = SimpleNamespace(units={"v": "V", "i": "A", "omega": "rad/s"})
+    run = SimpleNamespace(units={"v": "V", "i": "A", "omega": "rad/s"}, inputs={}, outputs={}, meta={}, name="run1")
     nrmse, rmse = {"i": 0.0168, "omega": 0.00815}, {"i": 0.0042, "omega": 0.149}
     limit = SimpleNamespace(name="CurrentLimit(8 A)", label="2 rows at the limit", value=31.4, unit="A", active=2)
     return SimpleNamespace(
