@@ -117,8 +117,7 @@ _PUSHES = (  # words, balance, carrier, quantities
     ("a loss of voltage", "voltage", "", ("omega", "v", "i", "t", "run")),
     ("a gain of the voltage", "voltage", "v", ("t", "turn", "load", "past load", "past braking",
                                                    "past heat", *COMPUTED_INPUTS)),
-    ("a resistance", "voltage", "i", ("t", "turn", "theta", "omega", "v", "load", "run", "past heat",
-                                            *COMPUTED_INPUTS)),
+    ("a resistance", "voltage", "i", ("t", "turn", "theta", "omega", "load", "run", "past heat", *COMPUTED_INPUTS)),
     ("a motor constant", "both", "", ("t", "turn", "theta", "omega", "i", "run", "past i", "past size", "most i")))
 FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quantities in _PUSHES for on in quantities),
          *(Form("a gain of the speed sensor", "sensor", on, "omega", "omega") for on in ("turn", "t")),
