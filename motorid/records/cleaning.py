@@ -29,7 +29,7 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     `notes` and those made here end up in ``meta["notes"]``; a recording was resumed at ``meta["parts"]``, s."""
     said = [*notes, *layout.notes]
     places = dict(layout.places)
-    columns = _without_marks(columns, {p.column for c, p in places.items() if c != "t"} - {*texts}, said)
+    columns = _without_marks(columns, {p.column for c, p in places.items() if c not in ("t", "v")} - {*texts}, said)
     t = _time(columns, texts, places.pop("t"), said)
     values = {c: _channel(columns, texts, place, c) for c, place in places.items()}
     rows, t, begun = _rows_in_order(t, layout.places["t"].column, said)
@@ -73,13 +73,14 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
 
 
 def _without_marks(columns: Mapping[str, Array], measured: Iterable[str], said: list[str]) -> dict[str, Array]:
-    """Count as missing what loggers write where nothing was measured: a number of `_MARKS`, far from all others."""
+    """Count as missing what loggers write where nothing was measured: a number of `_MARKS`, far from all others. A
+    command may be any number: a duty cycle of 16 bits is 0 or 65535."""
     columns = {n: np.where(np.isnan(c), np.nan, c) for n, c in columns.items()}  # one of a damaged file may signal
     for name in sorted(measured):
         marked = np.isin(y := columns[name], _MARKS)
         rest = y[~marked & np.isfinite(y)]
         for mark in np.unique(y[marked]) if rest.size else ():
-            if np.abs(rest - mark).min() > np.ptp(rest):
+            if 0 < np.ptp(rest) < np.abs(rest - mark).min():
                 y[y == mark] = np.nan
                 said.append(f"'{name}' holds {mark:g}, far from all other values: taken for a missing sample.")
     return columns

@@ -237,8 +237,9 @@ def _with_whole_stamps(table: TextTable, labels: Sequence[str], columns: Mapping
         m = _FRACTION.fullmatch(fine)
         if m and m[1] in wholes and fine in table.columns and fine not in asked:
             s, part = table.columns[whole := wholes[m[1]]], table.columns[fine] * _SIZES[m[2].lower()]
-            if np.all((part >= 0) & (part < 1) | np.isnan(part)) and np.isfinite(s).any():
-                table = replace(table, columns={**table.columns, whole: s - s[np.isfinite(s)][0] + part})
+            known = np.isfinite(s) & np.isfinite(part)
+            if known.any() and np.all((part[known] >= 0) & (part[known] < 1) & (s[known] == np.floor(s[known]))):
+                table = replace(table, columns={**table.columns, whole: s - s[known][0] + part})
                 sums[whole] = fine
     named = {hit.channel for c in labels if c not in sums and (hit := classify(c)) and hit.score > 1}
     if sums and "t" not in {*columns} | named:

@@ -311,6 +311,12 @@ def test_stamps_in_seconds_and_a_fraction_are_one_time(tmp_path, whole, fine, si
     np.testing.assert_allclose(other.t, np.arange(20))  # a plain name goes first
 
 
+def test_a_time_in_two_units_is_not_added_up(tmp_path):
+    rows = "".join(f"{1e-3 * k:.3f},{k},1,{k}\n" for k in range(20))
+    run = read_csv(write(tmp_path, "time_s,time_ms,u,w\n" + rows), columns={"t": "time_s"})
+    np.testing.assert_allclose(run.t, 1e-3 * np.arange(20))
+
+
 # -- rows ---------------------------------------------------------------------------------------------------
 
 
@@ -336,6 +342,8 @@ def test_the_mark_of_a_missing_sample_is_no_value(mark, tmp_path):
     np.testing.assert_array_equal(run.outputs["omega"], [0, 1, np.nan, 3, 4, np.nan, 6, 7, 8, 9])
     assert f"'w_rad_s' holds {mark}" in notes(run)
     assert "missing in 2 of 10" in notes(run)
+    duty = read_csv(write(tmp_path, table(range(10), [0, mark] * 5, range(10))))
+    np.testing.assert_array_equal(duty.inputs["v"], [0, mark] * 5)  # a command may be any number
     near = read_csv(write(tmp_path, table(range(10), [1] * 10, np.linspace(0, mark, 10).round())))
     assert near.outputs["omega"][-1] == mark  # a value like the others
 
