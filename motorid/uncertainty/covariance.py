@@ -30,16 +30,33 @@ def check_level(level: float) -> None:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Covariance(Printed):
-    """What the data say about the unknowns of a fit."""
+    """What the data say about the unknowns of a fit.
 
-    names: tuple[str, ...]  # of the unknowns: free parameters, then initial states
-    values: Array  # (k,)
-    matrix: Array  # (k, k), covariance in physical units; NaN in rows and columns of what is not determined
-    status: Mapping[str, str]  # "determined", "not determined", "at its lower limit" or "at its upper limit"
-    positive: tuple[bool, ...]  # which unknowns cannot be zero or negative
+    Attributes
+    ----------
+    names : tuple of str
+        Unknowns: free parameters, then initial states.
+    values : ndarray, shape (k,)
+    matrix : ndarray, shape (k, k)
+        Covariance in physical units; NaN in the rows of what is not determined.
+    status : mapping of str to str
+        ``"determined"``, ``"not determined"``, ``"at its lower limit"`` or ``"at its upper limit"``.
+    positive : tuple of bool
+        Which unknowns cannot be zero or negative.
+    dof : float
+        Effective degrees of freedom of the residuals.
+    colours : mapping of str to Colour
+        Per channel, of the whitened residuals.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    matrix: Array
+    status: Mapping[str, str]
+    positive: tuple[bool, ...]
     method: str
-    dof: float  # effective degrees of freedom of the residuals
-    colours: Mapping[str, Colour]  # per channel, of the whitened residuals
+    dof: float
+    colours: Mapping[str, Colour]
     units: tuple[str, ...]
 
     @cached_property

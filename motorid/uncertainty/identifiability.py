@@ -51,22 +51,43 @@ class WeakDirection:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identifiability(Printed):
-    """What records can tell about parameters, at one point."""
+    """What records can tell about parameters, at one point.
+
+    Attributes
+    ----------
+    values, sizes : ndarray, shape (k,)
+        Parameters and what a relative change of one means: the value, or the natural size where it may be zero.
+    t : tuple of ndarray
+        Per run, s.
+    sensitivities : tuple of dict of str to ndarray (N, k)
+        Per run and channel: change over the channel's RMS per relative change of a parameter.
+    singular_values : ndarray, shape (k,)
+        Of the stacked matrix, whitened by the noise, initial states projected out.
+    directions : ndarray, shape (k, k)
+        Rows: right singular vectors.
+    structural_rank : int
+        Largest rank at random points: what any such experiment without noise determines.
+    combinations : tuple of str
+        Products that are determined although their factors are not, e.g. ``"R·J"``.
+    remedies : tuple of str
+        What to fix or to measure for full rank.
+    fitted_std : mapping of str to float or None, optional
+        Standard deviations of the fit, where there is one.
+    """
 
     names: tuple[str, ...]
-    values: Array  # (k,), parameters
-    sizes: Array  # (k,), what a relative change of one means: the value, or the natural size where it may be zero
+    values: Array
+    sizes: Array
     units: tuple[str, ...]
-    t: tuple[Array, ...]  # per run (N,), s
-    # Per run and channel (N, k): change over the channel's RMS per relative change of a parameter.
+    t: tuple[Array, ...]
     sensitivities: tuple[Mapping[str, Array], ...]
-    singular_values: Array  # (k,), of the stacked matrix, whitened by the noise, initial states projected out
-    directions: Array  # (k, k), rows: right singular vectors
-    structural_rank: int  # largest rank at random points: what any such experiment without noise determines
+    singular_values: Array
+    directions: Array
+    structural_rank: int
     weak: tuple[WeakDirection, ...]
-    combinations: tuple[str, ...]  # products that are determined although their factors are not, e.g. "R·J"
-    remedies: tuple[str, ...]  # what to fix or to measure for full rank
-    fitted_std: Mapping[str, float | None] | None = None  # standard deviations of the fit, where there is one
+    combinations: tuple[str, ...]
+    remedies: tuple[str, ...]
+    fitted_std: Mapping[str, float | None] | None = None
 
     @property
     def rank(self) -> int:
