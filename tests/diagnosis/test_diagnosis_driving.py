@@ -215,9 +215,11 @@ def test_of_a_late_speed_alone_a_late_voltage_is_named_too(lab):
 def test_a_late_speed_is_not_taken_for_a_late_voltage(lab):
     rng = np.random.default_rng(8)
     runs = [recorded(lab, {}, stairs(1500, rng), 1e-3, rng, name=f"r{k}") for k in range(3)]
-    runs = [r.with_(outputs={**r.outputs, "omega": np.roll(r.outputs["omega"], 4)}) for r in runs]
+    late = [np.concatenate([np.full(4, y[0]), y[:-4]]) for y in (r.outputs["omega"] for r in runs)]  # from rest
+    runs = [r.with_(outputs={**r.outputs, "omega": y}) for r, y in zip(runs, late, strict=True)]
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("speed_delay", "speed_lag", "coulomb"))
     assert found.effects == ("speed_delay",)
+    assert found.remaining.adequate
     assert "--delay" not in found.text
 
 
