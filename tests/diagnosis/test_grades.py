@@ -197,6 +197,19 @@ def test_what_explains_less_than_it_leaves_is_not_named(rubbing, monkeypatch, sh
     assert told.grade == "named"
 
 
+@pytest.mark.parametrize(("there", "grade"), [(0.3, "approximates"), (0.7, "named")])
+def test_what_explains_the_fitted_runs_alone_is_not_named_beside_more_than_noise(rubbing, monkeypatch, there, grade):
+    root, last, _ = explaining(0.5, rubbing)
+    seen, unseen = ({c: replace(e, values=tuple(v / np.sqrt(1 - share) for v in e.values)) for c, e in errors.items()}
+                    for share, errors in ((0.9, last.predictions.blocks), (there, last.predictions.held_out)))
+    monkeypatch.setattr(misspecification, "better_forms", lambda fit, rival: [])
+    worse = replace(last, predictions=Predictions(seen, unseen))
+    (told,) = misspecification.grades_of(last, root, (), (), True, lambda name: worse)
+    assert told.grade == grade
+    (told,) = misspecification.grades_of(last, root, (), (), False, lambda name: worse)
+    assert told.grade == "named"
+
+
 def test_a_share_is_that_of_the_step_where_the_effect_came(rubbing, monkeypatch):
     """The same measure as the ladder's: runs add up, whatever each alone would say."""
     root, last, worse = explaining(0.3, rubbing)
