@@ -83,7 +83,7 @@ def _in_wrong_units(free: Sequence[str], row: Units, known: Container[str], note
     for label in free:
         name, unit, sure = headers.unit_in(label)
         hit = headers.classify(name) if (unit := row[label] or (unit if sure else None)) else None
-        if hit and unit and hit.score >= 3 and hit.channel not in known and not any(label in n for n in notes):
+        if hit and unit and hit.score >= 3 and hit.channel not in known and not any(f"'{label}'" in n for n in notes):
             found.append(label)
             c, one = hit.channel, f"0.001 {SI[DIMENSIONS[hit.channel][0]]}"
             notes.append(f"not used: '{label}'; it is named like {_MEANING[c]}, and {unit.label} is no unit of that. "

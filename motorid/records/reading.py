@@ -213,9 +213,10 @@ def _of_table(table: TextTable, columns: Mapping[str, object] | None, units: Map
         columns = {**parse_pairs(own["columns"], "columns"), **(columns or {})}
         labels = [c for c in labels if c in columns.values()]
     labels = [c for c in labels if not _is_copy(c, labels, table)]
-    table, labels, columns = _with_whole_stamps(table, labels, columns or {})
-    if dt is not None:
-        table, columns, units = _timed(table, columns, units or {}, dt)
+    if dt is None:
+        table, labels, columns = _with_whole_stamps(table, labels, columns or {})
+    else:
+        table, columns, units = _timed(table, columns or {}, units or {}, dt)
         labels = [*labels, columns["t"]]
     layout = assign(labels, columns=columns, units=units, unit_row=table.unit_row, values=table.columns)
     parts = tuple(float(m[1]) for m in map(_PART.fullmatch, table.comments) if m)
@@ -234,15 +235,14 @@ def _with_whole_stamps(table: TextTable, labels: Sequence[str], columns: Mapping
     sums, asked = dict[str, str](), {str(column) for column in columns.values()}
     wholes = {m[1]: c for c in labels if c in table.columns and (m := _SECONDS.fullmatch(c))}
     for fine in labels:
-        m = _FRACTION.fullmatch(fine)
-        if m and m[1] in wholes and fine in table.columns and fine not in asked:
+        if (m := _FRACTION.fullmatch(fine)) and m[1] in wholes and fine in table.columns and fine not in asked:
             s, part = table.columns[whole := wholes[m[1]]], table.columns[fine] * _SIZES[m[2].lower()]
             known = np.isfinite(s) & np.isfinite(part)
             if known.any() and np.all((part[known] >= 0) & (part[known] < 1) & (s[known] == np.floor(s[known]))):
                 table = replace(table, columns={**table.columns, whole: s - s[known][0] + part})
                 sums[whole] = fine
-    named = {hit.channel for c in labels if c not in sums and (hit := classify(c)) and hit.score > 1}
-    if sums and "t" not in {*columns} | named:
+    if sums and "t" not in columns and not any(
+            hit.channel == "t" and hit.score > 1 for c in labels if c not in sums and (hit := classify(c))):
         first = next(iter(sums))
         columns = {**columns, "t": first}
         table = replace(table, notes=[*table.notes, f"'{first}' and '{sums[first]}' together are the time."])

@@ -311,6 +311,11 @@ def test_stamps_in_seconds_and_a_fraction_are_one_time(tmp_path, whole, fine, si
     np.testing.assert_allclose(other.t, np.arange(20))  # a plain name goes first
 
 
+def test_who_says_how_far_samples_are_apart_wants_no_stamps(tmp_path):
+    path = write(tmp_path, "stamp.sec,stamp.nanosec,u,w\n" + "".join(f"7,{k},1,{k}\n" for k in range(20)))
+    np.testing.assert_allclose(read_csv(path, dt=0.01).t, 0.01 * np.arange(20))
+
+
 def test_a_time_in_two_units_is_not_added_up(tmp_path):
     rows = "".join(f"{1e-3 * k:.3f},{k},1,{k}\n" for k in range(20))
     run = read_csv(write(tmp_path, "time_s,time_ms,u,w\n" + rows), columns={"t": "time_s"})
