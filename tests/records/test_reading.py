@@ -154,6 +154,8 @@ DIALECTS = {
         pattern='"{t:.3f}"|"{v}"|"{i:.3f}"|"{w:.3f}"\n').replace(".", ",").replace("|", ","),
     "delimiter at the end": GOOD.replace("\n", ",\n"),
     "delimiter at the end of rows only": HEADER + rows().replace("\n", ",\n"),
+    "statements": HEADER + rows().replace("\n", ";\n"),
+    "statements of words": GOOD.replace(",", " ").replace("\n", "; \n"),
     "blank lines": "\n\n" + GOOD.replace("\n", "\n\n"),
     "Windows": GOOD.replace("\n", "\r\n"),
     "old Mac": GOOD.replace("\n", "\r"),
