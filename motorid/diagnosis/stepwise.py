@@ -26,7 +26,7 @@ from motorid.diagnosis.predictive_score import QUICK, HeldOut, is_sure
 from motorid.diagnosis.refit import INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.remainder import alone_predicting_more, beside_leaving_noise
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
-from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, MATERIAL, PLAIN, TRIFLE
+from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, MATERIAL, TRIFLE
 from motorid.diagnosis.verdict import first_answer
 from motorid.errors import OutOfTime, otherwise
 from motorid.estimation.fit import TOO_FAR, UNFOLLOWED, follows, growth, in_windows, solve
@@ -34,7 +34,6 @@ from motorid.estimation.least_squares import FAILURES
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect
 from motorid.numerics import parallel
-from motorid.problem.simulate import largest
 from motorid.records.experiment import Experiment, units_of
 
 ORDER = ("named", "group", "approximates")  # grades, the surest first
@@ -179,15 +178,14 @@ def _still_alike(found: Climb) -> tuple[tuple[tuple[str, ...], ...], tuple[Fit, 
 
 def _beside_curves(found: Climb) -> Climb:
     """Return a climb with grades that hold beside the curve that leads, fitted beside a special case of it, or in its
-    place; where the error is plain to see also in the place of all that was found: slopes lead astray far away."""
+    place; where the first model does not follow also in the place of all that was found: slopes lead astray there."""
     search, best, grades = found.search, found.path[-1], list(found.grades)
     if (found.remaining.adequate and at_noise(best)) or all(g.grade == "approximates" for g in grades):
         return found
     special = {e.name: share for gain in found.forms[:1] for e in best.fit.model.effects
                if e.name not in search.root.key and (share := differs(best.fit, gain.form, e)) is not None}
     curve = beside_leaving_noise(best, found.forms[0].form, special, search.held) if special else None
-    elsewhere = {c: e.nrmse for c, e in best.predictions.held_out.items()}
-    if not (curve and curve.smaller) and max(largest(best.fit.nrmse), largest(elsewhere)) > PLAIN and (
+    if not (curve and curve.smaller) and (
             alone := alone_predicting_more(best, search.root.fit, search.held, [gain.form for gain in found.forms])):
         curve, special = alone, dict.fromkeys(best.key, np.inf)
     for k, g in enumerate(grades):
