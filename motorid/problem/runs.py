@@ -27,6 +27,7 @@ CREEP_SHARE = 0.2  # of the angle's noise that a stuck motor may creep
 NARROWEST = 1e-5  # of the highest speed
 FINEST = 256  # sub-steps per sample
 OFF = 0.02  # of the largest voltage: as good as none
+SAME = 1e-6  # of it: what averaging may change
 
 # A record is frozen, and so are its noise and its size.
 _levels: WeakKeyDictionary[Experiment, dict[str, float]] = WeakKeyDictionary()
@@ -80,7 +81,7 @@ def time_since(run: Experiment, name: str) -> Array:
     t, v = run.t, run.inputs["v"]
     off = np.abs(v) <= OFF * np.abs(v).max()
     if name == "since_change":  # by more than noise, which a second difference has, a ramp hardly
-        moved = np.abs(np.diff(v)) > 3.4 * np.median(np.abs(np.diff(v, 2)))
+        moved = np.abs(np.diff(v)) > 3.4 * np.median(np.abs(np.diff(v, 2))) + SAME * np.abs(v).max()
     elif name == "since_switch":
         moved = off[1:] != off[:-1]
     else:

@@ -14,7 +14,7 @@ from motorid.errors import DataError, ModelError, UsageError
 from motorid.estimation.least_squares import RACE, least_squares
 from motorid.exporters.casadi_file import runs_of
 from motorid.problem.problem import as_problem
-from motorid.problem.runs import initial_state, top_acceleration
+from motorid.problem.runs import initial_state, time_since, top_acceleration
 from motorid.problem.simulate import simulate
 from motorid.records.experiment import windows
 
@@ -536,3 +536,12 @@ def test_a_fit_keeps_the_trajectories_of_where_it_is_alone():
     assert links <= 2
     assert end.simulate(end.start, 3).dx.shape[2] == len(end.unknown)
     assert end._latest[3][1].dx.shape[2] < len(end.unknown) / 2
+
+
+def test_a_voltage_that_is_averaged_over_longer_steps_has_not_changed():
+    """Their mean rounds, and a firmware that saves power had nothing that it could depend on."""
+    t = np.linspace(0, 4, 4001)
+    run = mi.Experiment(t, {"v": np.repeat([0.0, 6.1, -7.2, 3.3], 1002)[:4001]}, {"omega": 0 * t})
+    thin = time_since(run.decimate(3), "since_change")
+    assert thin == pytest.approx(time_since(run, "since_change")[::3], abs=4e-3)
+    assert thin[767] == pytest.approx(0.3, abs=4e-3)
