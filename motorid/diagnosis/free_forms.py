@@ -273,14 +273,17 @@ def functions_of(form: Form, span: Span) -> list[str]:
 def _sided(form: Form, lengths: Array, top: float) -> list[str]:
     """Return functions of what does not come back the way it went, as source: play, ramps, what feels a change."""
     z, sensor = form.on.removeprefix("past "), form.balance == "sensor"
+    if z == "path":
+        return [f"slew(z, {_place(r, r / 10, 10 * r, '1/rad')})" for r in 1 / lengths]
     if not (form.channel == z if sensor else (form.balance, z) == ("voltage", "v")):
         return []
     unit = {"v": "V", "i": "A", "omega": "rad/s"}[z]
     found = [f"(z - play(z, {_place(w, w / 10, top, unit)}))" for w in top * np.geomspace(*PLAY, len(lengths))]
+    rates = [_place(r, r / 10, 10 * r, f"{unit}/s".replace("/s/s", "/s²")) for r in top / lengths]
     if sensor:
         places = [_place(length, lengths[0] / 10, lengths[-1] * 10) for length in lengths]
-        return found + [f"(z - {f}(z, {place}))" for f in ("past", "hold") for place in places]
-    return found + [f"(z - ramp(z, {_place(r, r / 10, 10 * r, 'V/s')}))" for r in top / lengths]
+        found += [f"(z - {f}(z, {place}))" for f in ("past", "hold") for place in places]
+    return found + [f"(z - {'slew' if sensor else 'ramp'}(z, {rate}))" for rate in rates]
 
 
 def _along(form: Form, span: Span, low: float, high: float) -> list[str]:
@@ -375,10 +378,11 @@ def past(z: Array, along: Array, length: float, initial: float) -> Array:
     return np.interp(along, even, np.concatenate([[initial], lagged]))
 
 
-STEPS = {  # from the last value to the next: of what plays, is ramped up and falls at once, jumps up and falls late, or
-    # is dragged along by the square of its slip (both sides feel the same torque)
+STEPS = {  # from the last value to the next: of what plays, is ramped up and falls at once, follows only so fast, jumps
+    # up and falls late, or is dragged along by the square of its slip (both sides feel the same torque)
     "play": lambda last, z, width, dt: min(max(last, z - width), z + width),
     "ramp": lambda last, z, rate, dt: np.sign(z) * min(abs(z), max(last * np.sign(z), 0.0) + rate * dt),
+    "slew": lambda last, z, rate, dt: min(max(z, last - rate * dt), last + rate * dt),
     "hold": lambda last, z, length, dt: z if abs(z) > abs(last) else z + (last - z) * np.exp(-dt / length),
     "drag": lambda last, z, way, dt: z + (last - z) / (1 + abs(last - z) * dt / way)}
 

@@ -66,19 +66,25 @@ STATES = {  # quantities that are states of the curve's own: name, where it begi
     "most i": ("most_i", "ca.fabs(m.start['i'])", "ca.fmax(ca.fabs(m.i) - most_i, 0) / {step}")}
 SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V", "load": "W"}
 OTHER_PLACES = {"1": "where it sets in, a share of the largest", "V": "half of its play", "A": "half of its play",
-                "rad/s": "how fast it swings, or half of its play", "V/s": "how fast it rises",
+                **dict.fromkeys(("V/s", "A/s", "rad/s²"), "how fast it rises or follows"),
+                "rad/s": "how fast it swings, or half of its play", "1/rad": "how fast it turns over",
                 "1:wave": "how many to the turn", "rad:phase": "its phase", "rad:wide": "half of its width",
                 "rad:edge": "how wide its edges are", "rad:slip": "how far it slips until what it drags along follows"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
 CLIPPED = re.compile(r"ca\.fmin\(ca\.fmax\(z, \S+\), \S+\)")
-MEMORY = re.compile(r"((past|play|ramp|hold|drag)\(z, (.*?)\))")
+MEMORY = re.compile(r"((past|play|ramp|slew|hold|drag)\(z, (.*?)\))")
 RATES = {  # of what follows z, with one place
     "past": "(z - {s}) / {p}", "play": "(ca.fmax(z - {p} - {s}, 0) - ca.fmax({s} - z - {p}, 0)) / {step}",
     "ramp": "ca.if_else(z < 0, -1, 1) * (ca.fmin({p}, (ca.fabs(z) - ca.if_else(z < 0, -{s}, {s})) / {step})"
             " + ca.fmax(ca.if_else(z < 0, {s}, -{s}), 0) / {step})",
+    "slew": "ca.fmin(ca.fmax((z - {s}) / {step}, -{p}), {p})",
     "hold": "(z - {s}) / ca.if_else(ca.fabs(z) > ca.fabs({s}), {sample}, {p})",
     "drag": "(z - {s}) * ca.fabs(z - {s}) / {p}"}
+FOLLOWS = {"play": "what a play of {} either way takes", "ramp": "what it is ahead of one that rises by at most {}",
+           "slew": "what it is ahead of one that changes by at most {}",
+           "hold": "what it is behind one that falls late, within {}",
+           "drag": "the square of the slip against what follows within {}"}
 POSITIVE = "ca.fmax(curve, -0.5) - 0.25 / ca.fmin(curve, -0.5) - 0.5"  # above -1, smooth; from -0.5 on as it is
 CARRIERS = {"": "", "direction": "m.sign(m.omega) * ", "omega": "m.omega * ", "i": "m.i * ", "v": "m.v * "}
 
@@ -277,9 +283,7 @@ class Curve:
             each = product(powers, free_forms.memories_of(part.form, part.span))  # in the order of the functions
             forms = [(f"{base}{power}one lag of {number(length, 2)} {over}", [lags[:, j] for j in (k, *also)])
                      for k, (power, length) in enumerate(each)]
-            slips = ((float(PLACE.findall(f)[0][0]), k) for k, f in enumerate(functions) if "drag(" in f)
-            forms += [(f"the square of the slip against what follows within {number(way, 2)} rad", [lags[:, k]])
-                      for way, k in slips]
+            forms += [(words, [lags[:, k]]) for k, words in _followers(functions)]
             unit = part.unit(self.fit, bare=True)
         return sorted((_closed(text, functions, value, unit) for text, functions in forms), key=lambda f: f[1])
 
@@ -724,6 +728,15 @@ def _grown(curve: Curve, form: Form, moved: bool, before: Predictions, held: Hel
                 return
             curve, best = replace(larger, first=curve.first or larger), gained.gain
             yield Grown(gained, predicted, curve)
+
+
+def _followers(functions: Sequence[str]) -> Iterator[tuple[int, str]]:
+    """Yield the places of functions of what follows, but for lags, and what they are in words."""
+    for k, f in enumerate(functions):
+        if (m := MEMORY.search(f)) and m[2] != "past" and (at := PLACE.match(m[3])):
+            size, unit = float(at[1]), (at[4] or "s").partition(":")[0]
+            slack = f"a slack of {number(2 / size, 2)} rad"  # turned over between a reversal and its end
+            yield k, FOLLOWS[m[2]].format(f"{number(size, 2)} {unit}") if "(z - " in f else slack
 
 
 def _closed_forms(on: str, z: Array) -> list[tuple[str, Sequence[Array]]]:

@@ -19,7 +19,7 @@ def _filter(m: Equations, channel: str, name: str, T, a: tuple, b: tuple = ()) -
 
 
 @effect(balance="sensor")
-def speed_lag(m: Equations, T_w=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0),
+def speed_lag(m: Equations, T_w=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0), pole=True,
                                   doc="time constant of the speed filter")):
     """First-order lag of the speed measurement. Åström & Murray, Feedback Systems, 2008."""
     _filter(m, "omega", "lagged", T_w, (1,))

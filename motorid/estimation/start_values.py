@@ -18,7 +18,7 @@ from motorid.records.experiment import Experiment
 ABOVE = 1.3  # times: where a size starts that is at least another
 RESONANCE = "1/s"
 STOPPED = 100.0  # times the friction and the back-EMF, where friction leaves a hundredth of the motion
-LEFT = 0.1  # of an inductance, where another lag takes the rest
+LEFT = 0.1  # of an inductance or inertia, where another lag takes the rest
 BACK_EMF_SHARES = (0.3, 0.03)
 PHASES = tuple(np.arange(4) * np.pi / 2)
 
@@ -119,12 +119,15 @@ def _led(problem: Problem, best: Estimate | None) -> Problem:
 
 
 def exchanged_poles(model: Model, effect: Effect) -> list[dict[str, float]]:
-    """Return the start at which a lag of an effect has changed places with the winding's own, L/R, and is nearly as
-    long as that: half as long it would be where the one valley ends and the other begins."""
+    """Return the starts at which a lag of an effect has changed places with the winding's own, L/R, or the motor's, and
+    is nearly as long as that: half as long it would be where the one valley ends and the other begins."""
     free = {n for n, p in model.parameters.items() if p.vary and not p.given}
-    lags = [p.name for p in effect.parameters if p.pole and p.name in free] if "L" in free else []
-    own = model.parameters["L"].value if lags else 0.0
-    return [{n: (1 - LEFT) * own / model.parameters["R"].value, "L": LEFT * own} for n in lags]
+    if not (lags := [p.name for p in effect.parameters if p.pole and p.name in free]):
+        return []
+    at = {n: p.value for n, p in model.parameters.items()}
+    coupling = at["K"] ** 2 / at["R"] if {"K", "R"} <= at.keys() else 0.0
+    own = {n: at[n] / by for n, by in (("L", at.get("R", 0.0)), ("J", coupling + at.get("b", 0.0))) if n in free and by}
+    return [{lag: (1 - LEFT) * time, n: LEFT * at[n]} for lag in lags for n, time in own.items()]
 
 
 def _contained(model: Model) -> dict[Effect, Effect]:
