@@ -279,7 +279,8 @@ def _sided(form: Form, lengths: Array, top: float) -> list[str]:
         return []
     unit = {"v": "V", "i": "A", "omega": "rad/s"}[z]
     found = [f"(z - play(z, {_place(w, w / 10, top, unit)}))" for w in top * np.geomspace(*PLAY, len(lengths))]
-    rates = [_place(r, r / 10, 10 * r, f"{unit}/s".replace("/s/s", "/s²")) for r in top / lengths]
+    rates = [_place(r, r / 10, 10 * r, f"{unit}/s".replace("/s/s", "/s²"))
+             for r in top / np.geomspace(lengths[0], lengths[-1], 3 * len(lengths))]
     if sensor:
         places = [_place(length, lengths[0] / 10, lengths[-1] * 10) for length in lengths]
         found += [f"(z - {f}(z, {place}))" for f in ("past", "hold") for place in places]

@@ -108,40 +108,21 @@ class Missing(Shown):
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One effect (or pair) tried.
+    """One effect (or pair) tried."""
 
-    Attributes
-    ----------
-    effect : str
-        Name; a pair is ``"a + b"``.
-    predicted_drop, refit_drop : float or None
-        Share of chi² that vanishes, predicted from the sensitivities and after refitting.
-    validation_nrmse : dict of str to float or None
-        Held-out errors after refitting.
-    held_out_gain : float or None
-        Relative fall of the error on held-out runs, or on held-out blocks without them: geometric mean over channels
-        and runs, lone wrong samples left aside; None where it came to no such test.
-    gain, gain_se : float or None
-        Difference of the log predictive density on data left out (nats), and its standard error.
-    parameters : dict of str to float
-        Of the effect, SI: refitted values where there was a refit, else predicted.
-    group : tuple of str
-        Effects that these records do not distinguish from it.
-    reason : str
-        Why it was taken or not.
-    """
-
-    effect: str
-    predicted_drop: float
-    refit_drop: float | None = None
-    validation_nrmse: Mapping[str, float] | None = None
+    effect: str  # its name; a pair is "a + b"
+    predicted_drop: float  # share of chi² that vanishes, by the sensitivities, and
+    refit_drop: float | None = None  # after refitting
+    validation_nrmse: Mapping[str, float] | None = None  # held-out errors after refitting
+    # Relative fall of the error on held-out runs, or on held-out blocks without them: geometric mean over channels and
+    # runs, lone wrong samples left aside; None where it came to no such test.
     held_out_gain: float | None = None
-    parameters: Mapping[str, float] = field(default_factory=dict)
-    group: tuple[str, ...] = ()
+    parameters: Mapping[str, float] = field(default_factory=dict)  # of the effect, SI: refitted, or else predicted
+    group: tuple[str, ...] = ()  # effects that these records do not distinguish from it
     accepted: bool = False
-    reason: str = ""
-    gain: float | None = None
-    gain_se: float | None = None
+    reason: str = ""  # why it was taken or not
+    gain: float | None = None  # difference of the log predictive density on data left out (nats), and
+    gain_se: float | None = None  # its standard error
     fit: Fit | None = field(default=None, repr=False)
 
 

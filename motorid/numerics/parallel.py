@@ -269,12 +269,6 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False, at_m
     `total` of tasks it shows the time left, which may be less if the total is `at_most`. What is `short` has no bar in
     its first second in a notebook, where a bar leaves an empty output. It yields ``advance(n=1, at_work="", done=None,
     total=None)``: `at_work` takes the place of `text`; `done` is how many tasks are, parts of one included.
-
-    Examples
-    --------
-    >>> with progress("Refitting", total=3) as advance:
-    ...     for _ in range(3):
-    ...         advance()
     """
     if (outer := _outer.get()) is not None:
         outer(0, text)

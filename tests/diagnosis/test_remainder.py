@@ -620,6 +620,22 @@ def loose_encoder(m, g=mi.P(0.05, "rad", null=0.0)):
     m.measure("theta", m.measured("theta") - g * z)
 
 
+@mi.effect(balance="sensor")
+def slack_pinion(m, share=mi.P(1.0, "", null=0.0)):
+    """An encoder behind a pinion with a twentieth of a radian of play either way."""
+    shown = m.state("shown")
+    m.rate(shown, (ca.fmax(m.theta - 0.05 - shown, 0) - ca.fmax(shown - m.theta - 0.05, 0)) / 1e-4)
+    m.measure("theta", m.theta + share * (shown - m.theta))
+
+
+@mi.effect(balance="sensor")
+def unbelieving(m, share=mi.P(1.0, "", null=0.0)):
+    """A firmware that believes no acceleration above a limit."""
+    shown = m.state("shown", m.start["omega"])
+    m.rate(shown, ca.fmin(ca.fmax((m.omega - shown) / 1e-4, -2500), 2500))
+    m.measure("omega", m.omega + share * (shown - m.omega))
+
+
 @mi.effect(balance="torque")
 def governor(m, c=mi.P(0.5, "", null=0.0)):
     """Weights that fly outwards."""
@@ -752,6 +768,18 @@ def test_what_changes_in_sensors_inertia_and_supply_is_found(law, channels, foll
     before, after = (mi.evaluate(f, runs[2]).nrmse for f in (found.best, fit))
     assert max(after[c] / floor[c] for c in after) < 1.1
     assert max(before[c] / after[c] for c in after) > 2.5
+
+
+@pytest.mark.parametrize(("law", "channels", "words"), [
+    (slack_pinion, ANGLE[::2], "a slack of 0.1"), (unbelieving, ANGLE[:2], "that changes by at most 2500 rad/s²")])
+def test_what_a_sensor_follows_only_so_far_or_so_fast_is_said(law, channels, words, lab):
+    runs, floor = _with_law(law, channels, lab)
+    left = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "quadratic_drag")).remainder
+    assert len(left.as_effect().parameters) == 2
+    (said, missed), after = left.nearest()[0], mi.evaluate(left.fitted, runs[2]).nrmse
+    assert words in said
+    assert missed < 0.1
+    assert max(after[c] / floor[c] for c in after) < 1.1
 
 
 def test_what_happened_before_a_part_of_a_record_shows_on_whole_ones(lab, monkeypatch):

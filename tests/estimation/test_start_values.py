@@ -217,7 +217,8 @@ def test_a_lag_of_a_sensor_that_changed_places_with_the_motor_is_found(rng):
     truth = mi.dc_motor(R=0.67, L=1e-3, K=0.058, b=5e-5, J=8.8e-5) + mi.effects.coulomb(tau_c=0.104) + lag(T_w=0.014)
     run = mi.Experiment(t, {"v": np.repeat([0, 12, -8, 5, -12, 3.0], 250)}, {"omega": 0 * t})
     speed = mi.simulate(truth, run, initial="rest")[0].outputs["omega"]
-    rubbing = mi.fit(mi.dc_motor() + mi.effects.coulomb, run.with_(outputs={"omega": speed + rng.standard_normal(1500)}))
+    run = run.with_(outputs={"omega": speed + rng.standard_normal(len(t))})
+    rubbing = mi.fit(mi.dc_motor() + mi.effects.coulomb, run)
     found = refit(rubbing, rubbing.model + lag, [{"T_w": k * 1e-3} for k in (1, 4, 16)])
     assert found is not None
     assert found.misfit["omega"] < 1.05
