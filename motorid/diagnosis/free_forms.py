@@ -277,14 +277,13 @@ def _sided(form: Form, lengths: Array, top: float) -> list[str]:
         return [f"slew(z, {_place(r, r / 10, 10 * r, '1/rad')})" for r in 1 / lengths]
     if not (form.channel == z if sensor else (form.balance, z) == ("voltage", "v")):
         return []
-    unit = {"v": "V", "i": "A", "omega": "rad/s"}[z]
+    unit, rate = {"v": ("V", "V/s"), "i": ("A", ""), "omega": ("rad/s", "rad/s²")}[z]
     found = [f"(z - play(z, {_place(w, w / 10, top, unit)}))" for w in top * np.geomspace(*PLAY, len(lengths))]
-    rates = [_place(r, r / 10, 10 * r, f"{unit}/s".replace("/s/s", "/s²"))
-             for r in top / np.geomspace(lengths[0], lengths[-1], 3 * len(lengths))]
     if sensor:
         places = [_place(length, lengths[0] / 10, lengths[-1] * 10) for length in lengths]
         found += [f"(z - {f}(z, {place}))" for f in ("past", "hold") for place in places]
-    return found + [f"(z - {'slew' if sensor else 'ramp'}(z, {rate}))" for rate in rates]
+    rates = top / np.geomspace(lengths[0], lengths[-1], 3 * len(lengths)) if rate else []  # no amplifier is so slow
+    return found + [f"(z - {'slew' if sensor else 'ramp'}(z, {_place(r, r / 10, 10 * r, rate)}))" for r in rates]
 
 
 def _along(form: Form, span: Span, low: float, high: float) -> list[str]:

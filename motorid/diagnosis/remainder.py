@@ -66,7 +66,7 @@ STATES = {  # quantities that are states of the curve's own: name, where it begi
     "most i": ("most_i", "ca.fabs(m.start['i'])", "ca.fmax(ca.fabs(m.i) - most_i, 0) / {step}")}
 SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V", "load": "W"}
 OTHER_PLACES = {"1": "where it sets in, a share of the largest", "V": "half of its play", "A": "half of its play",
-                **dict.fromkeys(("V/s", "A/s", "rad/s²"), "how fast it rises or follows"),
+                **dict.fromkeys(("V/s", "rad/s²"), "how fast it rises or follows"),
                 "rad/s": "how fast it swings, or half of its play", "1/rad": "how fast it turns over",
                 "1:wave": "how many to the turn", "rad:phase": "its phase", "rad:wide": "half of its width",
                 "rad:edge": "how wide its edges are", "rad:slip": "how far it slips until what it drags along follows"}
