@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -20,11 +21,11 @@ from motorid.diagnosis.model_comparison import far
 from motorid.diagnosis.record_versions import parts_remark
 from motorid.diagnosis.refit import with_lags_exchanged
 from motorid.diagnosis.remainder import Remainder
-from motorid.diagnosis.results import Diagnosis, Ladder
+from motorid.diagnosis.results import Adequacy, Diagnosis, Ladder
 from motorid.diagnosis.stepwise import Climb, explored, ladder_of
 from motorid.display.numbers import listed, number
 from motorid.effects import LIBRARY, OTHER
-from motorid.errors import MotoridError, at_least, numbers_told, otherwise
+from motorid.errors import MotoridError, OutOfTime, at_least, numbers_told, otherwise
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
 from motorid.model.model import SHOWN, Model
@@ -78,12 +79,15 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
     tried = library(effects, also, checked(fit, "diagnose").model.parameters)
     with parallel.progress("Looking for what is missing", max_effects + 1, at_most=True) as show:
         stages = Stages(max_effects, progress, show, map)
+        began = time.monotonic()
         found, driven = explored(fit, validate, tried, stages, max_effects, budget)
         stages.done("located what is missing")
         twice = repeated(fit.problem.experiments, [validate] if isinstance(validate, Experiment) else validate or ())
         misread = _contradicting(found, fit.problem.experiments)
         records = () if driven else fit.problem.experiments  # as they were read
-        return _told(found, misread, " ".join(w for w in (twice, driven) if w), validate is not None, records)
+        spent = time.monotonic() - began
+        with parallel.budget(None if budget is None else max(budget - spent, 0.0)):
+            return _told(found, misread, " ".join(w for w in (twice, driven) if w), validate is not None, records)
 
 
 @parallel.one_thread
@@ -126,15 +130,14 @@ def _contradicting(found: Climb, runs: Sequence[Experiment]) -> str:
 
 def _told(found: Climb, misread: str, driven: str, validated: bool, records: Sequence[Experiment]) -> Diagnosis:
     """Return what a climb found, in words and as a result; first how the records contradict themselves, `misread`."""
-    fit, ladder, remaining = found.search.root.fit, ladder_of(found, validated), found.remaining
+    fit, ladder = found.search.root.fit, ladder_of(found, validated)
     missing, judged, last, units = locate(fit), found.first, found.path[-1], units_of(fit.problem.experiments)
     graded = [g for g in found.grades if g.why != DIFFERENCED]
     names = tuple(g.effect for g in graded if g.grade != "approximates")
     ranking, groups = found.rounds[0] if found.rounds else (), tuple(g for g in found.groups if g[0] in names)
-    rivals = found.rivals if groups[:1] == found.groups[:1] else ()
-    forms, suggestion = in_turn(found.forms), None
-    remaining = following(remaining, forms[0].text) if forms else remaining
-    like = forms[0] if forms else next((g.form for g in graded if g.form is not None), None)
+    rivals, suggestion = found.rivals if groups[:1] == found.groups[:1] else (), None
+    remaining, left = _left(found, bool(names), bool(graded), records)
+    like = left.form or next((g.form for g in graded if g.form is not None and left.proposed), None)
     missing = acting_like(missing, like) if like is not None and not names else missing
     if names:
         verdict, where = "missing", WHERE[{e.name: e.balance for e in ladder.best.model.effects}[names[0]]]
@@ -151,25 +154,42 @@ def _told(found: Climb, misread: str, driven: str, validated: bool, records: Seq
     elif graded or not remaining.adequate:
         verdict, where = "unexplained", missing.where
         answer = words.unexplained_text(ranking, ladder.rungs, graded, like.text if like else "", remaining,
-                                        whole={*LIBRARY} <= {e.name for e in found.search.effects},
+                                        left.held_out, whole={*LIBRARY} <= {e.name for e in found.search.effects},
                                         done=bool(found.rounds) and not found.stopped)
         judged, known = (judged, []) if len(found.path) > 1 else (remaining, [remaining.text])
         details = [*known, missing.text, words.rises_text(ladder.rungs)]
     else:
         verdict, where, judged = "adequate", None, remaining
         answer, *details = words.adequate_text(judged, [c for c in ranking if not c.accepted], ladder.best)
-    more = "structure" if verdict == "unexplained" else "fluctuation"  # what imitates a structure hides it
-    kind = "structure" if not remaining.adequate else more if far(ladder.best) else "noise"
     details += [] if names else [words.unseen_remark(found.search.unseen(last), fit.model.base)]
     told = partial(worded, units=units, names=[run.name for run in fit.problem.experiments])
     answer, *details = (told(t) for t in (misread + answer, *details, *_remarks(found, driven)) if t)
     missing = replace(missing, text=told(missing.text), acts_like=told(missing.acts_like))
     judged, remaining = (replace(a, text=told(a.text)) for a in (judged, remaining))
     text = " ".join(t for t in (answer, *details, suggestion) if t)
-    approximating = {g.effect: g.form for g in found.grades if g.grade == "approximates"}
-    remainder = Remainder(kind, ladder.best, forms, found.search.held, fit, approximating, records)
     return Diagnosis(verdict, text, where, names, judged, missing, ranking, ladder, groups, suggestion, fit,
-                     ladder.best, remaining, remainder, found.stopped, answer, tuple(details), rivals or (ladder.best,))
+                     ladder.best, remaining, left, found.stopped, answer, tuple(details), rivals or (ladder.best,))
+
+
+def _left(found: Climb, named: bool, graded: bool, records: Sequence[Experiment]) -> tuple[Adequacy, Remainder]:
+    """Return what is left in words, and to go on with: led by its curve where nothing is named, since slopes of a model
+    that is far away may propose another."""
+    remaining, last, forms = found.remaining, found.path[-1].fit, in_turn(found.forms)
+    remaining = following(remaining, forms[0].text) if forms else remaining
+    more = "fluctuation" if named or (remaining.adequate and not graded) else "structure"  # which an imitation hides
+    kind = "structure" if not remaining.adequate else more if far(last) else "noise"
+    approximating = {g.effect: g.form for g in found.grades if g.grade == "approximates"}
+    left = Remainder(kind, last, forms, found.search.held, found.search.root.fit, approximating, records)
+    if not (named or found.stopped) and left.proposed:
+        found.search.stages.at("Growing a curve of what is left")
+        try:
+            left = left.led_by_its_curve()
+        except OutOfTime:
+            return remaining, left
+        except KeyboardInterrupt:
+            parallel.interruption.heard()
+        remaining = following(found.remaining, left.form.text) if left.form else found.remaining
+    return remaining, left
 
 
 def _remarks(found: Climb, driven: str) -> list[str]:

@@ -400,9 +400,9 @@ class Remainder:
 
     @property
     def proposed(self) -> bool:
-        """Tell whether slopes propose a curve; whether it helps, `as_effect` finds out."""
+        """Tell whether slopes propose a curve, which need not help, or one is known."""
         curve = self.form is not None or self._anew is not None or any(self._approximating.values())
-        return self.kind == "structure" and curve
+        return self.kind == "structure" and bool(self.__dict__.get("_best", curve))
 
     def as_effect(self, name: str = "remainder") -> Effect:
         """Return what is left as an effect, a curve: ``found.remainder.model + found.remainder.as_effect()``.
@@ -440,20 +440,41 @@ class Remainder:
         """The first part's quantity at the samples of all runs, and the missing torque, voltage or error there, SI."""
         return self._chosen.points
 
-    @cached_property
+    @property
     def _chosen(self) -> Curve:
         """The curve with which the model, fitted anew, predicts best."""
         if self.kind != "structure":
             raise UsageError(f"the remainder is {self.kind}: nothing is left that a curve over a quantity predicts.")
+        with contextlib.suppress(OutOfTime):
+            if self._best is not None:
+                return self._best.curve
+        raise UsageError("something predictable is left, but no curve over one quantity lowers the error on data "
+                         "left out; do these hold voltages or speeds that others lack?")
+
+    @cached_property
+    def _best(self) -> Grown | None:
+        """The same, with what it predicts; None where none helps. Raises OutOfTime before there is any."""
         best = None
-        with contextlib.suppress(OutOfTime), budget(SECONDS), looked_at():
+        with budget(SECONDS), looked_at():
             with contextlib.suppress(OutOfTime), budget(SECONDS / 2):  # they may be many times as long
                 best = (whole := self._on_whole) and whole._grown
-            best = best or self._grown
-        if best is None:
-            raise UsageError("something predictable is left, but no curve over one quantity lowers the error on data "
-                             "left out; do these hold voltages or speeds that others lack?")
-        return best.curve
+            if (best := best or self._grown) is None:
+                check_time()
+        return best
+
+    def led_by_its_curve(self) -> Remainder:
+        """Return the same with the forms of its curve first, or none where no curve helps. Raises OutOfTime."""
+        forms = dict.fromkeys((*(part.form for part in self._best.curve.parts), *self.forms)) if self._best else ()
+        found = replace(self, forms=tuple(forms))
+        found.__dict__["_best"] = self._best
+        return found
+
+    @property
+    def held_out(self) -> dict[str, float]:
+        """Errors with the curve, where it is known, on held-out runs, NRMSE; else on the fitted ones."""
+        best = self.__dict__.get("_best")
+        known = {c: e.nrmse for c, e in best.predictions.held_out.items()} if best else {}
+        return known or (dict(best.curve.fitted.nrmse) if best else {})
 
     @property
     def _grown(self) -> Grown | None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from motorid.channels import channel_name
 from motorid.diagnosis.adequacy import fine_angle_remark
-from motorid.diagnosis.misspecification import Grade
+from motorid.diagnosis.misspecification import IN_ITS_PLACE, Grade
 from motorid.diagnosis.model_comparison import Node, far, rarity, share_removed
 from motorid.diagnosis.results import Adequacy, Candidate, Rung
 from motorid.diagnosis.score_test import Score
@@ -57,8 +57,10 @@ def adequate_text(judged: Adequacy, ranking: Sequence[Candidate], last: Fit) -> 
 
 
 def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades: Sequence[Grade], like: str,
-                     remaining: Adequacy, *, whole: bool = True, done: bool = True) -> str:
-    """Return the answer when something is missing that the library does not have, or only something like it.
+                     remaining: Adequacy, curve: Mapping[str, float] | None = None, *, whole: bool = True,
+                     done: bool = True) -> str:
+    """Return the answer when something is missing that the library does not have, or only something like it; `curve`:
+    the errors with that as one.
 
     Not `whole`: only some effects were asked for. Not `done`: the search was stopped before all of these were tried.
     """
@@ -70,13 +72,15 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
         lead = f"Unexplained so far: {like or 'something is missing'}; not all effects were tried."
         lead += "" if grades else _promising({c.effect: c.predicted_drop for c in ranking})
     if grades:
-        curve = f"{like}, which the library lacks, predicts better in its place"  # the same in few words
         near, share, nearest = _nearest(rungs, grades, ranking)
         lead = (f"Unexplained, but close to {near}; better still is {like}, which {none} describes."
                 if near and like and done and share > MOST else f"{lead} Nearest: {near}." if near else lead)
         helps = approximations_text([g for g in grades if g not in nearest or not g.why.startswith("it removes")])
-        helps = helps.replace(curve, "a free curve predicts better")
-        return " ".join(t for t in (lead, helps, errors_text(rungs), _left(rungs[-1].fit, remaining)) if t)
+        for form in (g.form for g in grades if g.form):  # in few words, and another may lead when fitted
+            helps = helps.replace(IN_ITS_PLACE.format(form.text), "a free curve predicts better")
+        left = _left(rungs[-1].fit, remaining).replace(f" They follow {like}.", "")  # said already
+        return " ".join(t for t in (lead, helps, errors_text(rungs), curve_text(rungs, curve or {}), left) if t)
+    lead = f"{lead} {curve_text(rungs, curve or {})}".rstrip()
     best = max((c for c in ranking if c.refit_drop is not None), key=lambda c: c.refit_drop or 0.0, default=None)
     if best is None or (best.refit_drop or 0) <= 0.05:
         return lead
@@ -192,6 +196,13 @@ def errors_text(rungs: Sequence[Rung]) -> str:
     if any(is_[c] > was[c] * (1 + MATERIAL) for c in was if c not in noise):
         text += f" Over all channels it falls by {percent(1 - np.sqrt(1 - share_removed(was, is_)), 2)}."
     return text
+
+
+def curve_text(rungs: Sequence[Rung], errors: Mapping[str, float]) -> str:
+    """Say what the `errors` become with what is left as a curve; empty where none is known."""
+    was = moving(rungs[0].validation_nrmse or rungs[0].nrmse)
+    said = ", ".join(_changed(c, e, errors[c]) for c, e in was.items() if c in errors)
+    return f"With that as a curve{' on held-out runs' * bool(rungs[0].validation_nrmse)}: {said}." if said else ""
 
 
 def rises_text(rungs: Sequence[Rung]) -> str:
