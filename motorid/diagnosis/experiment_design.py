@@ -143,42 +143,23 @@ WORTH = 4.0  # nats between two rivals from which they count as distinguished
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Design(Printed):
-    """An experiment designed to distinguish models or to sharpen parameters.
+    """An experiment designed to distinguish models or to sharpen parameters."""
 
-    Attributes
-    ----------
-    goal : {"distinguish", "sharpen"}
-    excite : str
-        What to play: ``mi.record(port, "next.csv", excite=design.excite)``.
-    t, v : ndarray, shape (N,)
-        Time (s) and voltage (V), rounded as the bench plays it.
-    predicted, band : dict of str to dict of str to ndarray
-        Per rival and channel: prediction (N,), SI, and two standard deviations of it, noise included.
-    evidence : dict of (str, str) to (float, float)
-        Per (truth, rival): expected nats against the rival after its refit, by the best fixed candidate and by this.
-    deviations : dict of str to dict of str to (float, float, float)
-        Per rival and free parameter: expected standard deviation, SI: so far, with the best fixed candidate, with this.
-    peaks, limits : dict of str to float
-        Largest size in any rival, uncertain parameters included, and the limit; by ``v, i, omega, theta, dT``.
-    fixed, v_fixed : str, ndarray
-        The best fixed candidate, scaled to the same limits: its name and voltage (V).
-    status : str
-        ``"designed"``, or ``"stopped early"``: the best so far.
-    """
-
-    goal: str
-    excite: str
-    t: Array
-    v: Array
-    predicted: Mapping[str, Mapping[str, Array]]
-    band: Mapping[str, Mapping[str, Array]]
+    goal: str  # "distinguish" or "sharpen"
+    excite: str  # what to play: mi.record(port, "next.csv", excite=design.excite)
+    t: Array  # (N,), s, and the voltage, rounded as the bench plays it:
+    v: Array  # (N,), V
+    predicted: Mapping[str, Mapping[str, Array]]  # per rival and channel (N,), SI, and
+    band: Mapping[str, Mapping[str, Array]]  # two standard deviations of it, noise included
+    # Per (truth, rival): expected nats against the rival after its refit, by the best fixed candidate and by this.
     evidence: Mapping[tuple[str, str], tuple[float, float]]
+    # Per rival and free parameter: expected standard deviation, SI: so far, with the best fixed candidate, with this.
     deviations: Mapping[str, Mapping[str, tuple[float, float, float]]]
-    peaks: Mapping[str, float]
-    limits: Mapping[str, float]
-    fixed: str
-    v_fixed: Array
-    status: str
+    peaks: Mapping[str, float]  # largest sizes in any rival, uncertain parameters included, and
+    limits: Mapping[str, float]  # their limits; by v, i, omega, theta, dT
+    fixed: str  # the best fixed candidate, scaled to the same limits: its name, and
+    v_fixed: Array  # its voltage, V
+    status: str  # "designed", or "stopped early": the best so far
 
     @property
     def text(self) -> str:

@@ -470,11 +470,11 @@ class Remainder:
         return found
 
     @property
-    def held_out(self) -> dict[str, float]:
-        """Errors with the curve, where it is known, on held-out runs, NRMSE; else on the fitted ones."""
-        best = self.__dict__.get("_best")
-        known = {c: e.nrmse for c, e in best.predictions.held_out.items()} if best else {}
-        return known or (dict(best.curve.fitted.nrmse) if best else {})
+    def errors(self) -> dict[str, float]:
+        """NRMSE with the curve, if it is known, on held-out runs; without any on the fitted ones."""
+        grown = self.__dict__.get("_best")
+        held_out = grown and {c: e.nrmse for c, e in grown.predictions.held_out.items()}
+        return held_out or (dict(self.fitted.nrmse) if grown else {})
 
     @property
     def _grown(self) -> Grown | None:

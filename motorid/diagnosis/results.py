@@ -66,36 +66,19 @@ class Binned:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Missing(Shown):
-    """Where the model fails.
+    """Where the model fails. Per run are time (s), missing voltage (V) and torque (N·m) that would make it match."""
 
-    Attributes
-    ----------
-    where : {"electrical", "mechanical", "sensor"} or None
-    t, voltage, torque : tuple of ndarray
-        Per run: time (s), missing voltage (V) and missing torque (N·m) that would make the model match.
-    signals : tuple of dict of str to ndarray
-        Per run: ``i, omega, theta, heat, t`` at the samples, as far as known.
-    shares : dict of str to float
-        Share of the misfit by balance: ``electrical``, ``mechanical``, ``sensor``.
-    regions : dict of str to float
-        Share of the misfit by region: standstill, reversal, acceleration, steady, high current.
-    bins : dict of str to tuple of Binned
-        ``"voltage"`` and ``"torque"`` against i, omega, theta, heat, t; the best explanation first.
-    acts_like : str
-        What it is like where the library lacks it, e.g. "a load that changes with the angle"; else empty.
-    """
-
-    where: str | None
+    where: str | None  # "electrical", "mechanical", "sensor", or None
     t: tuple[Array, ...]
     voltage: tuple[Array, ...]
     torque: tuple[Array, ...]
-    signals: tuple[Mapping[str, Array], ...]
-    shares: Mapping[str, float]
-    regions: Mapping[str, float]
-    bins: Mapping[str, tuple[Binned, ...]]
+    signals: tuple[Mapping[str, Array], ...]  # per run: i, omega, theta, heat, t at the samples, as far as known
+    shares: Mapping[str, float]  # of the misfit by balance: electrical, mechanical, sensor, and
+    regions: Mapping[str, float]  # by region: standstill, reversal, acceleration, steady, high current
+    bins: Mapping[str, tuple[Binned, ...]]  # "voltage" and "torque" against each signal, the best explanation first
     text: str
     torque_unit: str = "N·m"
-    acts_like: str = ""
+    acts_like: str = ""  # what it is like where the library lacks it, e.g. "a load that changes with the angle"
 
     def card(self) -> Card:
         """Return the shares of balances and regions, and what the missing depends on."""
@@ -128,31 +111,20 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Rung:
-    """One step of the ladder: what was added (None: the model to begin with), the fit, its errors.
-
-    Attributes
-    ----------
-    nrmse, validation_nrmse : dict of str to float
-        Per channel, on the fitted and on the held-out runs.
-    removed : tuple of str
-        Earlier effects that it made superfluous.
-    grade : {"named", "group", "approximates"} or None
-        ``named``: the thing itself; ``group``: one of several that these data cannot distinguish; ``approximates``: it
-        helps, and `why` says what speaks against its name.
-    gain, gain_se : float or None
-        Difference of the log predictive density on data left out (nats) from the rung before, and its standard error.
-    """
+    """One step of the ladder: what was added (None: the model to begin with), the fit, its errors."""
 
     added: str | None
     fit: Fit
-    nrmse: Mapping[str, float]
-    validation_nrmse: Mapping[str, float] | None
-    removed: tuple[str, ...] = ()
+    nrmse: Mapping[str, float]  # per channel, on the fitted runs, and
+    validation_nrmse: Mapping[str, float] | None  # on the held-out ones
+    removed: tuple[str, ...] = ()  # earlier effects that it made superfluous
     candidates: tuple[Candidate, ...] = ()
+    # "named": the thing itself; "group": one of several that these data cannot distinguish; "approximates": it helps,
+    # and `why` says what speaks against its name.
     grade: str | None = None
     why: str = ""
-    gain: float | None = None
-    gain_se: float | None = None
+    gain: float | None = None  # difference of the log predictive density on data left out (nats) from the rung before,
+    gain_se: float | None = None  # and its standard error
 
 
 @dataclass(frozen=True, eq=False, repr=False)

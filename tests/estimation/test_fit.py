@@ -476,7 +476,7 @@ def side_valley(rng):
     hidden = mi.dc_motor(**VALUES) + mi.effects.quadratic_drag(c_2=3e-6) + mi.effects.voltage_offset(V_0=0.4)
     t = np.arange(500) * 1e-3
     record = noisy(simulated(t, drive(t, 6.0), model=hidden), rng)
-    asked = mi.Problem(mi.dc_motor() + mi.effects.coulomb + mi.effects.speed_lag, [record])
+    asked = mi.Problem(mi.dc_motor() + mi.effects.coulomb + mi.effects.speed_delay, [record])
     begin = asked.start_at({"R": 300.0, "J": 1.0})
     return asked, least_squares.least_squares(begin, mi.LevenbergMarquardt(max_iterations=1))
 
