@@ -66,7 +66,7 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
     Returns
     -------
     Diagnosis
-        Printed, it is the verdict in words.
+        Printed, it is the verdict in words. Where nothing is named, `Diagnosis.remainder` has its curve already.
 
     Examples
     --------

@@ -407,7 +407,7 @@ class Remainder:
     def as_effect(self, name: str = "remainder") -> Effect:
         """Return what is left as an effect, a curve: ``found.remainder.model + found.remainder.as_effect()``.
 
-        The first call fits the model with each of the best curves: seconds, at most two minutes for the best so far.
+        The first call fits the model with each of the best curves, if no diagnosis has: at most for two minutes.
 
         Raises
         ------

@@ -936,7 +936,7 @@ def test_dry_friction_that_dies_out_with_the_distance_run_is_not_named(lab, monk
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb",))
     assert (found.verdict, found.effects, found.remainder.kind) == ("unexplained", (), "structure")
     assert "a friction that changes with the distance run, which the library lacks" in found.ladder.rungs[1].why
-    assert "follow a friction that changes with the distance run" in found.text
+    assert "better still is a friction that changes with the distance run, which none of the effects" in found.text
     for slopes in (grades, stepwise):
         monkeypatch.setattr(slopes, "better_forms", lambda *given: [])
     monkeypatch.setattr(stepwise, "_beside_curves", interrupted)
