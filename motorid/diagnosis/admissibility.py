@@ -20,6 +20,7 @@ HOTTEST = 300.0  # K above the surroundings: enamel of the best class ends at 22
 MELTS = 1060.0  # K above the surroundings: copper
 READ_BACK = 0.5  # of the noise of the angle: 0.02 on a real arm that hung from an elastic shaft, at most 1 elsewhere
 RUNS_ON = 0.1  # of its highest speed: slower is near enough to a stop; and of the travel: an impact is less deep
+EMPTY = "{} goes to zero with it, although the data determine it without it"
 EMPTIED = 1e-2  # of its value before: it has vanished
 LENGTHS = ("rad", "m")  # a gap that runs to its limit is none
 
@@ -130,8 +131,11 @@ def _emptied(fit: Fit, added: Effect, before: Fit) -> str:
         was, now = (f.values.get(p.name, 0.0) for f in (before, fit))
         told = (fit.std.get(p.name) or np.inf) < KNOWN * now  # small, but not zero: what was missing had made it large
         if p.positive and std is not None and std < KNOWN * was and now < EMPTIED * was and not told:
-            return f"{p.name} goes to zero with it, although the data determine it without it"
-    return ""
+            return EMPTY.format(p.name)
+    own = before.determined.get("time_constant")  # of records without a current J alone is open
+    if own is None or own.std > KNOWN * own.value or "time_constant" in fit.determined:
+        return ""
+    return EMPTY.format("the motor's own lag") if (fit.tau_m or np.inf) < EMPTIED * own.value else ""
 
 
 def _belied(fit: Fit, added: Effect) -> str:

@@ -172,8 +172,7 @@ def _told(found: Climb, misread: str, driven: str, validated: bool, records: Seq
 
 
 def _left(found: Climb, named: bool, graded: bool, records: Sequence[Experiment]) -> tuple[Adequacy, Remainder]:
-    """Return what is left in words, and to go on with: led by its curve where nothing is named, since slopes of a model
-    that is far away may propose another."""
+    """Return what is left in words, and to go on with: led by its curve where nothing is named, as slopes mislead."""
     remaining, last, forms = found.remaining, found.path[-1].fit, in_turn(found.forms)
     remaining = following(remaining, forms[0].text) if forms else remaining
     more = "fluctuation" if named or (remaining.adequate and not graded) else "structure"  # which an imitation hides
@@ -184,11 +183,9 @@ def _left(found: Climb, named: bool, graded: bool, records: Sequence[Experiment]
         found.search.stages.at("Growing a curve of what is left")
         try:
             left = left.led_by_its_curve()
-        except OutOfTime:
-            return remaining, left
-        except KeyboardInterrupt:
+            remaining = following(found.remaining, left.form.text) if left.form else found.remaining
+        except (OutOfTime, KeyboardInterrupt):
             parallel.interruption.heard()
-        remaining = following(found.remaining, left.form.text) if left.form else found.remaining
     return remaining, left
 
 

@@ -25,8 +25,6 @@ def with_error(value: float, std: float | None, unit: str = "", why: str = "not 
     '(2.034 ± 0.012)·10⁻⁵ kg·m²'
     >>> with_error(1.3, 0, "Ω")
     '1.3 Ω (fixed)'
-    >>> with_error(1.3, None, "Ω")
-    '1.3 Ω (not determined)'
     """
     tail = f" {unit}" if unit else ""
     if not math.isfinite(value):

@@ -251,6 +251,20 @@ def test_a_parameter_that_was_open_before_may_be_emptied():
     assert "goes to zero" not in objections(emptied, LIBRARY["current_lag"], open_)
 
 
+def test_a_late_sensor_leaves_the_motor_its_own_lag():
+    """Behind a bent drive curve a motor without inertia, whose speed is 48 ms late, and a brake left noise."""
+    run = _run(mi.dc_motor(**TRUE))
+    run = run.with_(outputs={"omega": run.outputs["omega"]})
+    before = mi.fit(mi.dc_motor(), run)
+    after = trial.refit(before, before.model + mi.effects.speed_lag, ({"T_w": 2e-4},))
+    assert after is not None
+    assert before.std["J"] is None
+    assert "own lag" not in objections(after, LIBRARY["speed_lag"], before)
+    shown = np.array([p.name != "J" for p in after.problem.unknown])
+    emptied = replace(after, values={**after.values, "J": 1e-4 * before.values["J"]}, jacobian=after.jacobian * shown)
+    assert "the motor's own lag goes to zero with it" in objections(emptied, LIBRARY["speed_lag"], before)
+
+
 def test_a_model_that_rests_on_the_measured_angle_says_so():
     run = _run(mi.dc_motor(**TRUE))
     own = mi.fit(mi.dc_motor() + mi.effects.cogging(N=12), run)
