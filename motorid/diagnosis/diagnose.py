@@ -33,6 +33,7 @@ from motorid.numerics import parallel
 from motorid.records.checks import as_command, contradictions, current_limit
 from motorid.records.experiment import Experiment, repeated, units_of
 
+CURVE = 30.0  # s for the curve of what is left, or as long as the search took
 SETTLED = 16.0  # of an expected χ² between two models: half of it, the gain, is two of its standard deviations, √χ²
 
 
@@ -86,7 +87,7 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
         misread = _contradicting(found, fit.problem.experiments)
         records = () if driven else fit.problem.experiments  # as they were read
         spent = time.monotonic() - began
-        with parallel.budget(None if budget is None else max(budget - spent, 0.0)):
+        with parallel.budget(max(spent, CURVE) if budget is None else min(max(budget - spent, 0.0), max(spent, CURVE))):
             return _told(found, misread, " ".join(w for w in (twice, driven) if w), validate is not None, records)
 
 

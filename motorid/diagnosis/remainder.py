@@ -466,7 +466,9 @@ class Remainder:
         """Return the same with the forms of its curve first, or none where no curve helps. Raises OutOfTime."""
         forms = dict.fromkeys((*(part.form for part in self._best.curve.parts), *self.forms)) if self._best else ()
         found = replace(self, forms=tuple(forms))
-        found.__dict__["_best"] = self._best
+        with contextlib.suppress(OutOfTime):
+            check_time()
+            found.__dict__["_best"] = self._best  # to its end: `as_effect` may take longer than a diagnosis does
         return found
 
     @property

@@ -23,8 +23,6 @@ def with_error(value: float, std: float | None, unit: str = "", why: str = "not 
     '1.302 ± 0.004 Ω'
     >>> with_error(2.0344e-5, 1.23e-7, "kg·m²")
     '(2.034 ± 0.012)·10⁻⁵ kg·m²'
-    >>> with_error(1.3, 0, "Ω")
-    '1.3 Ω (fixed)'
     """
     tail = f" {unit}" if unit else ""
     if not math.isfinite(value):

@@ -122,8 +122,7 @@ def exchanged_poles(model: Model, effect: Effect) -> list[dict[str, float]]:
     """Return the starts at which a lag of an effect has changed places with the winding's own, L/R, or the motor's, and
     is nearly as long as that: half as long it would be where the one valley ends and the other begins."""
     free = {n for n, p in model.parameters.items() if p.vary and not p.given}
-    if not (lags := [p.name for p in effect.parameters if p.pole and p.name in free]):
-        return []
+    lags = [p.name for p in effect.parameters if p.pole and p.name in free]
     at = {n: p.value for n, p in model.parameters.items()}
     coupling = at["K"] ** 2 / at["R"] if {"K", "R"} <= at.keys() else 0.0
     own = {n: at[n] / by for n, by in (("L", at.get("R", 0.0)), ("J", coupling + at.get("b", 0.0))) if n in free and by}

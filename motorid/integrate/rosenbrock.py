@@ -18,6 +18,7 @@ from motorid.integrate import compiled as cc
 from motorid.integrate.engine import Grid, Tolerance, Trajectory, address
 from motorid.integrate.rodas3 import ORDER, StepFunctions
 from motorid.model.equations import System
+from motorid.numerics.parallel import check_time
 from motorid.numerics.signals import Array
 
 PATIENCE = 1.5e7  # instructions of the virtual machine (0.05 s) before a step is worth compiling
@@ -68,6 +69,7 @@ class Rosenbrock:
         """
         passes, right, shown = float(MOST_PASSES), 0, None
         while passes > 0:
+            check_time()
             try:
                 traj = self.run(system, grid, x0, p, local_error=True)
             except SimulationError as failed:

@@ -268,8 +268,7 @@ def progress(text: str, total: float | None = None, *, quiet: bool = False, at_m
     log file, a worker process). Inside another one it only says what that one is at, so any function may use it. With a
     `total` of tasks it shows the time left, which may be less if the total is `at_most`. What is `short` has no bar in
     its first second in a notebook, where a bar leaves an empty output. It yields ``advance(n=1, at_work="", done=None,
-    total=None)``: `at_work` takes the place of `text`; `done` is how many tasks are, parts of one included.
-    """
+    total=None)``: `at_work` takes the place of `text`; `done` is how many tasks are, parts of one included."""
     if (outer := _outer.get()) is not None:
         outer(0, text)
     # A person sees standard error on a terminal, or in Jupyter; there without ipywidgets Rich warns instead of drawing.

@@ -61,8 +61,8 @@ def approximates(found):
         assert rung.grade == "approximates"
         assert ("which the library lacks, predicts better in its place" in rung.why
                 or "of the squared error, and the rest is not noise" in rung.why)
-        why = rung.why.replace(f"{found.missing.acts_like}, which the library lacks, predicts better in its place",
-                               "a free curve predicts better")
+        short = "a free curve predicts better"
+        why = re.sub("^.*, which the library lacks, predicts better in its place", short, rung.why)
         said = rf"'{rung.added}'[^:]* but only approximates? it: {re.escape(why)}"
         assert re.search(said, found.text)  # those with one reason share a sentence
         falls(before, rung, found.text)
