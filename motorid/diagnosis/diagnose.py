@@ -87,8 +87,8 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
         misread = _contradicting(found, fit.problem.experiments)
         records = () if driven else fit.problem.experiments  # as they were read
         spent = time.monotonic() - began
-        with parallel.budget(max(spent, CURVE) if budget is None else min(max(budget - spent, 0.0), max(spent, CURVE))):
-            return _told(found, misread, " ".join(w for w in (twice, driven) if w), validate is not None, records)
+        left = min(max(spent, CURVE), float("inf") if budget is None else max(budget - spent, 0.0))
+        return _told(found, misread, " ".join(w for w in (twice, driven) if w), validate is not None, records, left)
 
 
 @parallel.one_thread
@@ -129,7 +129,8 @@ def _contradicting(found: Climb, runs: Sequence[Experiment]) -> str:
     return f"The records seem to contradict themselves; check first: {said} Taken as they are: " if said else ""
 
 
-def _told(found: Climb, misread: str, driven: str, validated: bool, records: Sequence[Experiment]) -> Diagnosis:
+def _told(found: Climb, misread: str, driven: str, validated: bool, records: Sequence[Experiment],
+          seconds: float) -> Diagnosis:
     """Return what a climb found, in words and as a result; first how the records contradict themselves, `misread`."""
     fit, ladder = found.search.root.fit, ladder_of(found, validated)
     missing, judged, last, units = locate(fit), found.first, found.path[-1], units_of(fit.problem.experiments)
@@ -137,7 +138,7 @@ def _told(found: Climb, misread: str, driven: str, validated: bool, records: Seq
     names = tuple(g.effect for g in graded if g.grade != "approximates")
     ranking, groups = found.rounds[0] if found.rounds else (), tuple(g for g in found.groups if g[0] in names)
     rivals, suggestion = found.rivals if groups[:1] == found.groups[:1] else (), None
-    remaining, left = _left(found, bool(names), bool(graded), records)
+    remaining, left = _left(found, bool(names), bool(graded), records, seconds)
     like = left.form or next((g.form for g in graded if g.form is not None and left.proposed), None)
     missing = acting_like(missing, like) if like is not None and not names else missing
     if names:
@@ -172,7 +173,8 @@ def _told(found: Climb, misread: str, driven: str, validated: bool, records: Seq
                      ladder.best, remaining, left, found.stopped, answer, tuple(details), rivals or (ladder.best,))
 
 
-def _left(found: Climb, named: bool, graded: bool, records: Sequence[Experiment]) -> tuple[Adequacy, Remainder]:
+def _left(found: Climb, named: bool, graded: bool, records: Sequence[Experiment],
+          seconds: float) -> tuple[Adequacy, Remainder]:
     """Return what is left in words, and to go on with: led by its curve where nothing is named, as slopes mislead."""
     remaining, last, forms = found.remaining, found.path[-1].fit, in_turn(found.forms)
     remaining = following(remaining, forms[0].text) if forms else remaining
@@ -183,7 +185,8 @@ def _left(found: Climb, named: bool, graded: bool, records: Sequence[Experiment]
     if not (named or found.stopped) and left.proposed:
         found.search.stages.at("Growing a curve of what is left")
         try:
-            left = left.led_by_its_curve()
+            with parallel.budget(seconds):
+                left = left.led_by_its_curve()
             remaining = following(found.remaining, left.form.text) if left.form else found.remaining
         except (OutOfTime, KeyboardInterrupt):
             parallel.interruption.heard()

@@ -97,8 +97,7 @@ class Candidate:
     predicted_drop: float  # share of chi² that vanishes, by the sensitivities, and
     refit_drop: float | None = None  # after refitting
     validation_nrmse: Mapping[str, float] | None = None  # held-out errors after refitting
-    # Relative fall of the error on held-out runs, or on held-out blocks without them: geometric mean over channels and
-    # runs, lone wrong samples left aside; None where it came to no such test.
+    # Relative fall of the error on held-out runs, or blocks; geometric mean over channels and runs, spikes left aside.
     held_out_gain: float | None = None
     parameters: Mapping[str, float] = field(default_factory=dict)  # of the effect, SI: refitted, or else predicted
     group: tuple[str, ...] = ()  # effects that these records do not distinguish from it
@@ -119,8 +118,7 @@ class Rung:
     validation_nrmse: Mapping[str, float] | None  # on the held-out ones
     removed: tuple[str, ...] = ()  # earlier effects that it made superfluous
     candidates: tuple[Candidate, ...] = ()
-    # "named": the thing itself; "group": one of several that these data cannot distinguish; "approximates": it helps,
-    # and `why` says what speaks against its name.
+    # "named": the thing itself; "group": one of several that tie; "approximates": it helps, `why` speaks against it.
     grade: str | None = None
     why: str = ""
     gain: float | None = None  # difference of the log predictive density on data left out (nats) from the rung before,

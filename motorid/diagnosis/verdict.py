@@ -59,8 +59,7 @@ def adequate_text(judged: Adequacy, ranking: Sequence[Candidate], last: Fit) -> 
 def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades: Sequence[Grade], like: str,
                      remaining: Adequacy, curve: Mapping[str, float] | None = None, *, whole: bool = True,
                      done: bool = True) -> str:
-    """Return the answer when something is missing that the library does not have, or only something like it; `curve`:
-    the errors with that as one.
+    """Return the answer when something is missing that the library does not have; `curve`: the errors with that as one.
 
     Not `whole`: only some effects were asked for. Not `done`: the search was stopped before all of these were tried.
     """

@@ -36,6 +36,7 @@ from motorid.diagnosis.free_forms import (
 from motorid.diagnosis.locate import locate
 from motorid.diagnosis.predictive_score import Evidence, HeldOut
 from motorid.diagnosis.remainder import Curve, Part, Remainder
+from motorid.errors import OutOfTime
 from motorid.estimation.fit import over_moments, solve
 from motorid.exporters.export import load
 from motorid.numerics.parallel import budget, one_thread
@@ -780,6 +781,32 @@ def test_what_a_sensor_follows_only_so_far_or_so_fast_is_said(law, channels, wor
     assert words in said
     assert missed < 0.1
     assert max(after[c] / floor[c] for c in after) < 1.1
+
+
+def test_where_nothing_is_named_the_curve_leads_if_there_is_time(lab, monkeypatch):
+    """Slopes lead to an error that changes with the angle; fitted, it is a slack."""
+    runs, _ = _with_law(slack_pinion, ANGLE[::2], lab)
+    fit = mi.fit(mi.dc_motor(), runs[:2])
+
+    def found() -> mi.Diagnosis:
+        return mi.diagnose(fit, runs[2:], effects=("coulomb",))
+
+    by_curve = found()
+    assert by_curve.remainder.follows == "an error of the angle sensor that depends on the distance since a reversal"
+    assert by_curve.remainder.follows in by_curve.answer
+    assert "With that as a curve on held-out runs: " in by_curve.answer
+    monkeypatch.setattr(Remainder, "_best", None)  # no curve helps
+    without = found()
+    assert not without.remainder.proposed
+    assert "acts like" not in without.text
+
+    def late(left):
+        raise OutOfTime
+
+    monkeypatch.setattr(Remainder, "led_by_its_curve", late)
+    by_slopes = found()
+    assert by_slopes.remainder.follows == "an error of the angle sensor that changes with the angle"
+    assert "With that as a curve" not in by_slopes.answer
 
 
 def test_what_happened_before_a_part_of_a_record_shows_on_whole_ones(lab, monkeypatch):
