@@ -69,7 +69,6 @@ class Rosenbrock:
         """
         passes, right, shown = float(MOST_PASSES), 0, None
         while passes > 0:
-            check_time()
             try:
                 traj = self.run(system, grid, x0, p, local_error=True)
             except SimulationError as failed:
@@ -97,6 +96,8 @@ class Rosenbrock:
                 own = np.min(asked[few, None] / np.maximum(shown[few], 1e-300), axis=0)[:, None]
                 relative = (error / np.clip(own / level, sizes, loose / level * sizes)).max(axis=0)
             passes -= 1 if astray is None and not gone.any() else 1 / 128  # a record has hundreds
+            if passes % 1:
+                check_time()  # which take long
             finer = grid.substeps
             if np.max(relative, initial=0.0) > 2 * level:  # not where it is no number
                 factor = np.ceil(1.1 * (np.maximum(relative, 1e-300) / level) ** (1 / ORDER))

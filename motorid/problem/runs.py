@@ -26,8 +26,7 @@ SGN_WIDTH_SHARE = 1e-3  # of the highest speed: wider smoothing looks like one m
 CREEP_SHARE = 0.2  # of the angle's noise that a stuck motor may creep
 NARROWEST = 1e-5  # of the highest speed
 FINEST = 256  # sub-steps per sample
-OFF = 0.02  # of the largest voltage: as good as none
-SAME = 1e-6  # of it: what averaging may change
+OFF, SAME = 0.02, 1e-6  # of the largest voltage: as good as none; what averaging may change
 
 # A record is frozen, and so are its noise and its size.
 _levels: WeakKeyDictionary[Experiment, dict[str, float]] = WeakKeyDictionary()
