@@ -151,9 +151,9 @@ class Design(Printed):
     v: Array  # (N,), V
     predicted: Mapping[str, Mapping[str, Array]]  # per rival and channel (N,), SI, and
     band: Mapping[str, Mapping[str, Array]]  # two standard deviations of it, noise included
-    # Per (truth, rival): expected nats against the rival after its refit, by the best fixed candidate and by this.
+    # Expected nats by (truth, rival, refitted), with the best fixed candidate and with this one; expected standard
+    # deviation, SI, by rival and free parameter, so far and with either.
     evidence: Mapping[tuple[str, str], tuple[float, float]]
-    # Per rival and free parameter: expected standard deviation, SI: so far, with the best fixed candidate, with this.
     deviations: Mapping[str, Mapping[str, tuple[float, float, float]]]
     peaks: Mapping[str, float]  # largest sizes in any rival, uncertain parameters included, and
     limits: Mapping[str, float]  # their limits; by v, i, omega, theta, dT

@@ -464,19 +464,20 @@ class Remainder:
 
     def led_by_its_curve(self) -> Remainder:
         """Return the same with the forms of its curve first, or none where no curve helps. Raises OutOfTime."""
-        forms = dict.fromkeys((*(part.form for part in self._best.curve.parts), *self.forms)) if self._best else ()
-        found = replace(self, forms=tuple(forms))
+        best = self._best
+        zeros = best is not None and any(map(tells_the_zero, best.curve.fit.model.effects))  # another in every run
+        lead = [replace(p.form, zeroed=zeros and p.form.on == "turn") for p in best.curve.parts] if best else []
+        found = replace(self, forms=tuple(dict.fromkeys((*lead, *self.forms))) if lead else ())
         with contextlib.suppress(OutOfTime):
             check_time()
-            found.__dict__["_best"] = self._best  # to its end: `as_effect` may take longer than a diagnosis does
+            found.__dict__["_best"] = best  # to its end: `as_effect` may take longer than a diagnosis does
         return found
 
     @property
     def errors(self) -> dict[str, float]:
         """NRMSE with the curve, if it is known, on held-out runs; without any on the fitted ones."""
-        grown = self.__dict__.get("_best")
-        held_out = grown and {c: e.nrmse for c, e in grown.predictions.held_out.items()}
-        return held_out or (dict(self.fitted.nrmse) if grown else {})
+        best = self.__dict__.get("_best")
+        return {c: e.nrmse for c, e in best.predictions.held_out.items()} or dict(self.fitted.nrmse) if best else {}
 
     @property
     def _grown(self) -> Grown | None:

@@ -97,8 +97,7 @@ class Candidate:
     predicted_drop: float  # share of chi² that vanishes, by the sensitivities, and
     refit_drop: float | None = None  # after refitting
     validation_nrmse: Mapping[str, float] | None = None  # held-out errors after refitting
-    # Relative fall of the error on held-out runs, or blocks; geometric mean over channels and runs, spikes left aside.
-    held_out_gain: float | None = None
+    held_out_gain: float | None = None  # fall of the error on held-out runs, or blocks: geometric mean, spikes aside
     parameters: Mapping[str, float] = field(default_factory=dict)  # of the effect, SI: refitted, or else predicted
     group: tuple[str, ...] = ()  # effects that these records do not distinguish from it
     accepted: bool = False
@@ -118,8 +117,7 @@ class Rung:
     validation_nrmse: Mapping[str, float] | None  # on the held-out ones
     removed: tuple[str, ...] = ()  # earlier effects that it made superfluous
     candidates: tuple[Candidate, ...] = ()
-    # "named": the thing itself; "group": one of several that tie; "approximates": it helps, `why` speaks against it.
-    grade: str | None = None
+    grade: str | None = None  # "named", "group" (several tie), "approximates" (`why` says what speaks against it)
     why: str = ""
     gain: float | None = None  # difference of the log predictive density on data left out (nats) from the rung before,
     gain_se: float | None = None  # and its standard error

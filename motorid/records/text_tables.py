@@ -28,7 +28,6 @@ _GROUPS = {".": ",", ",": "."}  # decimal mark to what may stand between thousan
 _SPACES = " '’\u00a0\u2009\u202f"  # may stand there, too
 _GROUPED = {mark: rf"[-+]?[1-9]\d{{0,2}}(?:[{group}{_SPACES}]\d{{3}})+(?:\{mark}\d*)?"
             for mark, group in _GROUPS.items()}
-_ENDED = re.compile(r"^([^;]*[,\t ][^;]*);\s*$")  # a statement, not a cell
 _CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f]")
 _JSON = re.compile(r'\s*(\{\s*["}]|\[\s*[\[{])')  # objects, arrays of arrays or of objects
 # Delimiter (None: white space) and decimal mark, in the order in which a tie is decided.
@@ -59,7 +58,9 @@ def parse_table(data: bytes) -> TextTable:
     text, notes = decode(data)
     lines = [line for line in re.split(r"\r\n|\r|\n", text) if line.strip()]
     comments = [line.strip() for line in lines if line.lstrip().startswith(_COMMENT)]
-    body = [_ENDED.sub(r"\1", line) for line in lines if not line.lstrip().startswith(_COMMENT)]
+    body = [line for line in lines if not line.lstrip().startswith(_COMMENT)]
+    body = [b[:-1] if (b := row.rstrip()).endswith(";") and ";" not in b[:-1] and {*b} & {*",\t "} else row
+            for row in body]  # what ends a statement, and no cell
     body = body and _unnamed(body, notes)
     if not body:
         raise DataError("it holds no rows" + (", only comments." if comments else "; the file is empty."))
