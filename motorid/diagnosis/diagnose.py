@@ -156,7 +156,8 @@ def _told(found: Climb, misread: str, driven: str, validated: bool, records: Seq
     elif graded or not remaining.adequate:
         verdict, where = "unexplained", missing.where
         answer = words.unexplained_text(ranking, ladder.rungs, graded, like.text if like else "", remaining,
-                                        left.errors, whole={*LIBRARY} <= {e.name for e in found.search.effects},
+                                        words.curve_text(ladder.rungs, left.errors),
+                                        whole={*LIBRARY} <= {e.name for e in found.search.effects},
                                         done=bool(found.rounds) and not found.stopped)
         judged, known = (judged, []) if len(found.path) > 1 else (remaining, [remaining.text])
         details = [*known, missing.text, words.rises_text(ladder.rungs)]

@@ -57,9 +57,8 @@ def adequate_text(judged: Adequacy, ranking: Sequence[Candidate], last: Fit) -> 
 
 
 def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades: Sequence[Grade], like: str,
-                     remaining: Adequacy, curve: Mapping[str, float] | None = None, *, whole: bool = True,
-                     done: bool = True) -> str:
-    """Return the answer when something is missing that the library does not have; `curve`: the errors with that as one.
+                     remaining: Adequacy, curve: str = "", *, whole: bool = True, done: bool = True) -> str:
+    """Return the answer when something is missing that the library does not have; `curve`: what it does as one.
 
     Not `whole`: only some effects were asked for. Not `done`: the search was stopped before all of these were tried.
     """
@@ -72,14 +71,14 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
         lead += "" if grades else _promising({c.effect: c.predicted_drop for c in ranking})
     if grades:
         near, share, nearest = _nearest(rungs, grades, ranking)
-        lead = (f"Unexplained, but close to {near}; better still is {like}, which {none} describes."
-                if near and like and done and share > MOST else f"{lead} Nearest: {near}." if near else lead)
+        lead, near = (f"Unexplained, but close to {near}; better still is {like}, which {none} describes.", "") if (
+            near and like and done and share > MOST) else (lead, near and f"Nearest: {near}.")
         helps = approximations_text([g for g in grades if g not in nearest or not g.why.startswith("it removes")])
         for form in (g.form for g in grades if g.form):  # in few words, and another may lead when fitted
             helps = helps.replace(IN_ITS_PLACE.format(form.text), "a free curve predicts better")
         left = _left(rungs[-1].fit, remaining).replace(f" They follow {like}.", "")  # said already
-        return " ".join(t for t in (lead, helps, errors_text(rungs), curve_text(rungs, curve or {}), left) if t)
-    lead = f"{lead} {curve_text(rungs, curve or {})}".rstrip()
+        return " ".join(t for t in (lead, curve, near, helps, errors_text(rungs), left) if t)
+    lead = f"{lead} {curve}".rstrip()
     best = max((c for c in ranking if c.refit_drop is not None), key=lambda c: c.refit_drop or 0.0, default=None)
     if best is None or (best.refit_drop or 0) <= 0.05:
         return lead

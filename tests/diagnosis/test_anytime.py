@@ -16,6 +16,8 @@ from typer.testing import CliRunner
 import motorid as mi
 from motorid.cli.app import app
 from motorid.diagnosis import candidates, refit, stepwise
+from motorid.diagnosis import diagnose as diagnosing
+from motorid.diagnosis.locate import locate
 from motorid.diagnosis.misspecification import Grade
 from motorid.errors import OutOfTime
 from motorid.numerics.parallel import budget, check_time
@@ -218,6 +220,15 @@ def test_curves_are_asked_where_held_out_runs_hold_more_than_noise(monkeypatch, 
                            (SimpleNamespace(form=None),), (Grade("winding_heating", "named"),))
     assert stepwise._beside_curves(found).grades == found.grades
     assert bool(asked) is not noise
+
+
+def test_what_a_finished_search_says_takes_no_part_of_the_time_for_a_curve(plain, monkeypatch):
+    asked = []
+    monkeypatch.setattr(diagnosing, "time", SimpleNamespace(monotonic=lambda: 0.0))
+    monkeypatch.setattr(diagnosing, "CURVE", 0.0)
+    monkeypatch.setattr(diagnosing, "locate", lambda fit: (asked.append(check_time()), locate(fit))[1])
+    assert mi.diagnose(plain, effects=("coulomb",)).verdict
+    assert asked == [None]
 
 
 def test_a_curve_in_the_place_of_all_is_tried_whatever_error_is_left(monkeypatch):
