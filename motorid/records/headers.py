@@ -223,7 +223,7 @@ def _by_words(words: list[str], unit: Unit | None, explicit: bool) -> HeaderMatc
     longest = max(len(w) for w in words if _CHANNEL.get(w.rstrip("0123456789"), channel) == channel)
     if not explicit:  # u_a, theta_m: the letter is an index, not a unit; but speed_V is a tacho
         return None if score < 1 or (longest > 2 and unit.label in ("V", "A")) else HeaderMatch(channel, None, score)
-    return _by_unit(words, unit, explicit) if longest < 3 else None
+    return None if longest > 2 or (channel in "iv" and math.isnan(unit.factor)) else _by_unit(words, unit, explicit)
 
 
 def _channel_of(words: list[str]) -> tuple[str | None, float]:

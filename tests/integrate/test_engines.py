@@ -17,6 +17,7 @@ import motorid as mi
 from motorid.effects import LIBRARY
 from motorid.errors import FitError, ModelError, SimulationError, UsageError
 from motorid.integrate import Cvodes, Grid, Idas, Rosenbrock, engine_of, limited
+from motorid.integrate.rodas3 import StepFunctions
 from motorid.integrate.rosenbrock import stepper
 from motorid.model.equations import System
 from motorid.numerics.parallel import one_thread
@@ -212,6 +213,22 @@ def test_order_of_the_rosenbrock_step_is_three(hold):
     orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
     assert (orders > 2.8).all()
     assert (orders < 3.4).all()
+
+
+def test_a_step_costs_in_proportion_to_what_remembers_the_motor_and_acts_on_it():
+    """Eliminated after the motor, n memories would fill n² places."""
+
+    def instructions(n: int) -> int:
+        @mi.effect(balance="torque")
+        def remembered(m, c=mi.P(1e-6, "N·m·s/rad", null=0.0)):
+            for k in range(n):
+                m.rate(z := m.state(f"past_{k}"), (m.omega - z) / 0.1)
+                m.torque -= c * z
+
+        return StepFunctions((mi.dc_motor() + remembered).system(("omega",))).light.n_instructions()
+
+    few, some, many = map(instructions, (0, 10, 20))
+    assert many - some < 1.2 * (some - few)
 
 
 def test_a_limit_on_the_steps_ends_the_choice_of_steps_before_they_are_taken():

@@ -782,7 +782,7 @@ def test_a_voltage_that_hardly_changes_beside_a_duty_cycle_is_the_supply(voltage
         assert scaled.inputs["v"] == pytest.approx(1e-3 * table["voltage"].to_numpy())
 
 
-@pytest.mark.parametrize("header", ["current [counts]", "motor current (%)", "current [V]"])
+@pytest.mark.parametrize("header", ["current [counts]", "i [counts]", "motor current (%)", "current [V]"])
 def test_a_column_in_a_unit_that_its_name_cannot_have_is_told(tmp_path, header):
     text = f"time_s,voltage_V,{header},speed_rad_s\n" + _body(lambda k: f"{k * 1e-3:.3f}")
     run = read_csv(write(tmp_path, text))
