@@ -19,22 +19,12 @@ VERDICT_MOODS = {"adequate": "good", "missing": "note", "unexplained": "bad"}
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Adequacy(Shown):
-    """Is anything missing at all?
-
-    Attributes
-    ----------
-    p_value : float
-        Probability of residuals at least this bad from noise alone, coloured noise allowed for.
-    false_alarm : float
-        Rate of false alarms of the verdict.
-    channels : dict of str to dict
-        Per channel: ``noise`` and ``rms`` of the residual (SI), ``ratio`` of the two, ``autocorrelation`` at lag 1,
-        ``p_value``.
-    """
+    """Is anything missing at all?"""
 
     adequate: bool
-    p_value: float
-    false_alarm: float
+    p_value: float  # probability of residuals at least this bad from noise alone, coloured noise allowed for
+    false_alarm: float  # rate of false alarms of the verdict
+    # per channel: "noise" and "rms" of the residual (SI), "ratio" of the two, "autocorrelation" at lag 1, "p_value"
     channels: Mapping[str, Mapping[str, float]]
     text: str
     hum: str = ""  # what predicts errors larger than the noise, and is no motor's, in words

@@ -22,27 +22,13 @@ SMALL = 1e-3  # of an unknown's largest slope: a channel with smaller slopes is 
 
 @dataclass(frozen=True, eq=False)
 class DerivativeCheck:
-    """Exact derivatives against central finite differences, per unknown and channel.
+    """Exact derivatives against central finite differences, per unknown and channel, (unknowns, channels)."""
 
-    Attributes
-    ----------
-    unknowns : tuple of str
-        Free parameters, then estimated initial states.
-    channels : tuple of str
-        Measured channels, then ``"others"``: priors and penalties, where there are any.
-    difference : ndarray, shape (unknowns, channels)
-        Largest difference over the samples, relative to the largest exact slope in that channel.
-    slope : ndarray, shape (unknowns, channels)
-        Largest exact slope of the whitened residuals with respect to the solver's coordinate.
-    tolerance : float
-        What counts as agreement.
-    """
-
-    unknowns: tuple[str, ...]
-    channels: tuple[str, ...]
-    difference: Array
-    slope: Array
-    tolerance: float
+    unknowns: tuple[str, ...]  # free parameters, then estimated initial states
+    channels: tuple[str, ...]  # measured, then "others": priors and penalties, where there are any
+    difference: Array  # largest over the samples, relative to the largest exact slope in that channel
+    slope: Array  # largest exact one of the whitened residuals with respect to the solver's coordinate
+    tolerance: float  # what counts as agreement
 
     @property
     def worst(self) -> float:
