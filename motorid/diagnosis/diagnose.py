@@ -67,7 +67,8 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
     Returns
     -------
     Diagnosis
-        Printed, it is the verdict in words. Where nothing is named, `Diagnosis.remainder` has its curve already.
+        Printed, it is the verdict in words. Where nothing is named, `Diagnosis.remainder` has its curve already, but
+        for records that contradict themselves.
 
     Examples
     --------
@@ -87,7 +88,8 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
         misread = _contradicting(found, fit.problem.experiments)
         records = () if driven else fit.problem.experiments  # as they were read
         spent = time.monotonic() - began
-        left = min(max(spent, CURVE), float("inf") if budget is None else max(budget - spent, 0.0))
+        most = float("inf") if budget is None else max(budget - spent, 0.0)
+        left = 0.0 if misread else min(max(spent, CURVE), most)  # of records to be mended no curve is worth its time
         return _told(found, misread, " ".join(w for w in (twice, driven) if w), validate is not None, records, left)
 
 
@@ -183,7 +185,7 @@ def _left(found: Climb, named: bool, graded: bool, records: Sequence[Experiment]
     kind = "structure" if not remaining.adequate else more if far(last) else "noise"
     approximating = {g.effect: g.form for g in found.grades if g.grade == "approximates"}
     left = Remainder(kind, last, forms, found.search.held, found.search.root.fit, approximating, records)
-    if not (named or found.stopped) and left.proposed:
+    if not (named or found.stopped) and left.proposed and seconds:
         found.search.stages.at("Growing a curve of what is left")
         try:
             with parallel.budget(seconds):

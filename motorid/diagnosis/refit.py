@@ -135,6 +135,8 @@ def _on_its_own(along: Estimate, descent: Callable[[Problem], Estimate]) -> Esti
 
 def copies_the_angle(problem: Problem, q: Array) -> bool:
     """Tell whether the simulated angle copies the measured one that goes in: shaken a little, it does so, to half."""
+    if not (problem.model.angle_input and all("theta" in run.experiment.outputs for run in problem.runs)):
+        return False
     rng, runs, shakes = np.random.default_rng(0), [], []
     for run in problem.runs:
         theta = run.experiment.outputs["theta"]

@@ -27,7 +27,7 @@ from motorid.diagnosis.misspecification import FormGain, better_forms, chosen_fu
 from motorid.diagnosis.model_comparison import Node, at_noise, far
 from motorid.diagnosis.predictive_score import QUICK, Evidence, HeldOut, Predictions, compare
 from motorid.diagnosis.record_versions import fitted_to, whole_of
-from motorid.diagnosis.refit import refit
+from motorid.diagnosis.refit import copies_the_angle, refit
 from motorid.diagnosis.thresholds import CONTAINED, TRIFLE
 from motorid.display.numbers import listed, number, percent
 from motorid.effects import PER_RUN
@@ -348,9 +348,12 @@ class Curve:
         return slim.refitted(self.fitted or self.fit, slim.sizes) if len(values) < len(self.values) else None
 
     def refitted(self, last: Fit, *starts: Mapping[str, float]) -> Curve | None:
-        """Return the curve fitted with the model, from `starts` beside the `last` values or not; None if that fails."""
+        """Return the curve fitted with the model, from `starts` beside the `last` values or not; None if that fails, or
+        only tells the measured angle to follow itself."""
         done = refit(last, self.fit.model + self.effect, [{**w, **s} for s in starts for w in (last.values, {})])
-        return done and replace(self, values=tuple(done.values[n] for n in self.sizes), fitted=done)
+        if done is None or copies_the_angle(done.problem, done.q):
+            return None
+        return replace(self, values=tuple(done.values[n] for n in self.sizes), fitted=done)
 
     @property
     def law(self) -> str:

@@ -436,7 +436,8 @@ def _in_windows(found: Climb) -> Fit | None:
     astray = [any(e.nrmse**2 > UNFOLLOWED and e.misfit > LARGER for e in node.predictions.held_out.values())
               or not follows(node.fit) for node in (found.path[0], found.path[-1])]
     part = in_windows(fit, partial(solve, solver=QUICK, start="model")) if fit and growth(fit) >= TOO_FAR else None
-    if part is None and ((DRAWS_BACK & (found.path[-1].key - found.path[0].key) and astray[0]) or astray[1]):
+    held = last.model.angle_input or DRAWS_BACK & (found.path[-1].key - found.path[0].key)
+    if part is None and (astray[1] or (held and astray[0])):
         part = in_windows(first, partial(solve, solver=QUICK), drifts=True)
     return otherwise(None, FAILURES, lambda: part and solve(part.problem.with_(model=first.model, noise_factors={})))
 

@@ -335,8 +335,8 @@ def _spikes(run: Experiment) -> str | None:
         far = np.flatnonzero(np.isfinite(y) & ~kept)
         if far.size:
             size = float(np.median(np.abs(y[far] - np.interp(run.t[far], run.t[kept], y[kept]))))
-            return (f"{far.size} single samples of the {NAMES[channel]} stand about {size:.2g} {run.units[channel]} "
-                    "away from both neighbours: spikes of the sensor or the logger. Leave them out (--no-spikes, "
+            return (f"{far.size} samples of the {NAMES[channel]} stand about {size:.2g} {run.units[channel]} "
+                    "away from their neighbours: spikes of the sensor or the logger. Leave them out (--no-spikes, "
                     "run.without_spikes()), or fit with a loss that forgives outliers (--loss huber, loss=mi.Huber()).")
     return None
 

@@ -16,6 +16,7 @@ SHORTEST = 6  # samples that have a level
 PEAK = 6  # samples after a jump of the voltage, where the current has a peak
 FEWEST = 20  # finite samples among which one can stand out
 LEAST, MOST = 3, 0.05  # spikes of a channel: fewer may be chance, a larger share is no accident
+BEYOND = 1.5  # times the largest value else, which no blow gives a mass
 LONGEST = 3  # samples of a burst: a logger's line or two that are lost; longer ones may be a blow
 
 
@@ -100,7 +101,8 @@ def without_spikes(t: Array, y: Array, v: Array, inert: bool = False) -> Array:
     if np.isfinite(y).sum() < FEWEST:
         return y
     at = at if len(at := spikes(t, y, v)) >= LEAST else at[:0]
-    at = np.union1d(at, bursts(t, y, v)) if inert and np.ptp(v) > 0 else at  # a step shows how fast the motor is
+    if inert and np.ptp(v) > 0:  # a step shows how fast the motor is
+        at = np.union1d(np.union1d(at, bursts(t, y, v)), fading(t, y, v))
     if not 0 < len(at) <= MOST * len(t):
         return y
     y = y.copy()
@@ -121,6 +123,22 @@ def bursts(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
     far = [seen[a + 1:b + 1] for a, b in found
            if min(sizes[a], sizes[b]) > 2 * usual and max(np.abs(y[seen[[a, b + 1]]])) > least]
     return np.concatenate([np.empty(0, int), *far])
+
+
+def fading(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
+    """Return which samples jump at one voltage far beyond all that is reached else, and fade to where they were: a
+    filter's answer to an angle that wraps, or to a wrong sample."""
+    seen = np.flatnonzero(np.isfinite(y))
+    here, level = y[seen], np.cumsum(np.abs(np.diff(v, prepend=v[0])) > 0.02 * np.ptp(v))[seen]
+    sizes, found = np.abs(np.diff(here)), [np.empty(0, int)]
+    near = 3 * max(float(np.quantile(sizes, 0.9)), noise_level(y, t))
+    for a in np.flatnonzero(sizes > 4 * near).tolist():
+        away = np.abs(here[a + 1:a + 1 + int(MOST * len(here))] - here[a])
+        back = int(np.argmax(away < max(near, 0.02 * away[0])))  # 0: never
+        if back > 1 and level[a + 1 + back] == level[a] and np.all(np.diff(away[:back]) < near):
+            found.append(np.arange(a + 1, a + 1 + back))
+    usual = np.abs(np.delete(here, np.concatenate(found))).max(initial=0.0)
+    return seen[np.concatenate([k for k in found if not len(k) or np.abs(here[k[0]]) > BEYOND * usual])]
 
 
 def spikes(t: Array, y: Array, v: Array) -> NDArray[np.intp]:

@@ -71,7 +71,7 @@ def test_nothing_is_said_about_nothing():
 
 def test_real_records_are_remarked_on_with_reason(real):
     expected = {
-        "emps": [], "fibo": ["4 single samples of the speed"], "frc": ["never reverses"],
+        "emps": [], "fibo": ["4 samples of the speed stand"], "frc": ["never reverses"],
         "furuta_base": ["the angle advances 1.26", "at rest without a voltage"],  # -21 ± 7 mA in 1,700 samples
         "odri_mn4004": ["is 1 V from beginning to end", "uneven"], "xl330": ["uneven"],
         "unmotor": ["never reverses"],
@@ -397,12 +397,12 @@ def test_spikes_are_told_and_what_forgives_them(steps, rng):
     where = rng.choice(steps.n, 9, replace=False)
     y[where] += 20.0 * rng.choice([-1, 1], 9)
     remarks = said(steps.with_(outputs={**steps.outputs, "i": y}))
-    assert "single samples of the current stand about 20 A away" in remarks
+    assert "samples of the current stand about 20 A away" in remarks
     assert "--loss huber" in remarks
     pair = steps.outputs["i"].copy()
     for k in where:
         pair[k:k + 3] += 20.0  # three in a row are no spike
-    assert "single samples" not in said(steps.with_(outputs={**steps.outputs, "i": pair}))
+    assert "away from their neighbours" not in said(steps.with_(outputs={**steps.outputs, "i": pair}))
 
 
 def test_a_current_held_by_the_driver_is_told(plant, rng):
