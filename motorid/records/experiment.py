@@ -203,8 +203,8 @@ class Experiment(Shown):
         """Return the run with single samples that stand far from both neighbours marked as missing.
 
         Not next to jumps of the voltage, where the motor is quick; at least three, at most 5 % of a channel. Of speed
-        and angle, two or three in a row that jump there and back are left out too, and what jumps beyond all else and
-        fades: a mass cannot.
+        and angle, two or three in a row that jump there and back are left out too, what jumps beyond all else and
+        fades, and zeros, up to a fifth, amid what stays far from them: a mass cannot.
         """
         free = "tau_load" not in self.inputs  # a blow of the load may be as short
         outputs = {c: preprocessing.without_spikes(self.t, y, self.inputs["v"], inert=free and c != "i")

@@ -7,7 +7,7 @@ import scipy
 from numpy.typing import NDArray
 
 from motorid.errors import UsageError
-from motorid.numerics.signals import Array, integral, noise_level, robust_std
+from motorid.numerics.signals import Array, integral, noise_level, quantum, robust_std
 
 CLEAR = np.pi / 2  # rad: a step of the angle this far from what is expected may be a turn or none
 BESIDE = 3  # samples on either side of a jump of the angle that show whether the shaft goes on
@@ -16,6 +16,8 @@ SHORTEST = 6  # samples that have a level
 PEAK = 6  # samples after a jump of the voltage, where the current has a peak
 FEWEST = 20  # finite samples among which one can stand out
 LEAST, MOST = 3, 0.05  # spikes of a channel: fewer may be chance, a larger share is no accident
+MOST_LOST = 0.2  # share of readings that failed
+BESIDE = 25  # samples before and after a reading that failed
 BEYOND = 1.5  # times the largest value else, which no blow gives a mass
 LONGEST = 3  # samples of a burst: a logger's line or two that are lost; longer ones may be a blow
 
@@ -103,7 +105,11 @@ def without_spikes(t: Array, y: Array, v: Array, inert: bool = False) -> Array:
     at = at if len(at := spikes(t, y, v)) >= LEAST else at[:0]
     if inert and np.ptp(v) > 0:  # a step shows how fast the motor is
         at = np.union1d(np.union1d(at, bursts(t, y, v)), fading(t, y, v))
-    if not 0 < len(at) <= MOST * len(t):
+    if len(at) > MOST * len(t):
+        at = at[:0]
+    lost = dropouts(y) if inert else at[:0]
+    at = np.union1d(at, lost) if LEAST <= len(lost) <= MOST_LOST * len(t) else at
+    if not len(at):
         return y
     y = y.copy()
     y[at] = np.nan
@@ -139,6 +145,22 @@ def fading(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
             found.append(np.arange(a + 1, a + 1 + back))
     usual = np.abs(np.delete(here, np.concatenate(found))).max(initial=0.0)
     return seen[np.concatenate([k for k in found if not len(k) or np.abs(here[k[0]]) > BEYOND * usual])]
+
+
+def dropouts(y: Array) -> NDArray[np.intp]:
+    """Return which samples read exactly nothing, few in a row, amid others of one sign that all stay far from it:
+    readings that failed. A coarse counter reads nothing where it turns slowly."""
+    seen = np.flatnonzero(np.isfinite(y))
+    here, coarse = y[seen], 10 * quantum(y)
+    edges = np.flatnonzero(np.diff(here == 0, prepend=False, append=False))
+    found = [np.empty(0, int)]
+    for a, b in edges.reshape(-1, 2).tolist():
+        around = here[max(a - BESIDE, 0):b + BESIDE]
+        around = around[around != 0]
+        low, middle = np.quantile(np.sort(around * np.sign(np.median(around))), [0.02, 0.5]) if len(around) else (0, 0)
+        if b - a <= LONGEST and 0 < a < b < len(here) and low > 0.3 * middle > 0.3 * coarse:
+            found.append(seen[a:b])
+    return np.concatenate(found)
 
 
 def spikes(t: Array, y: Array, v: Array) -> NDArray[np.intp]:

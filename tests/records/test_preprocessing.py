@@ -11,7 +11,7 @@ from lab_records import simulated
 import motorid as mi
 from motorid.records.checks import unsigned, unsigned_voltage
 from motorid.records.experiment import Experiment
-from motorid.records.preprocessing import bursts, fading, spikes, unwrapped
+from motorid.records.preprocessing import bursts, dropouts, fading, spikes, unwrapped
 from motorid.records.reading import write_csv
 
 T = 1e-3 * np.arange(800)
@@ -231,6 +231,24 @@ def test_what_jumps_beyond_all_else_and_fades_is_left_out_and_no_blow():
         since = k % 1000 - 300
         blown = np.where((since > 0) & (since < 120), v / 6 * (36 + height * np.exp(-since / 30)), 6 * v)
         assert not len(fading(2e-3 * k, blown, v))
+
+
+def test_readings_that_failed_are_left_out_however_many_and_no_slow_counts():
+    """Zeros among the readings of an ESP32 hid all else: held-out error 40 → 33 % with them, 34 → 14 % without."""
+    rng, k = np.random.default_rng(5), np.arange(4000)
+    v = np.where(k // 1000 % 2, 40.0, 100.0)
+    good = 3 * scipy.signal.lfilter([1 - np.exp(-1 / 50)], [1, -np.exp(-1 / 50)], v) * (1 + 0.1 * rng.normal(size=4000))
+    failed = np.sort(rng.choice(np.arange(400, 3900), 300, replace=False))
+    failed = failed[(failed % 1000 > 300) & (failed % 1000 < 900)]
+    speed = good.copy()
+    speed[failed] = 0.0
+    gone = np.flatnonzero(np.isnan(Experiment(4e-3 * k, {"v": v}, {"omega": speed}).without_spikes().outputs["omega"]))
+    longest = [run for run in np.split(failed, np.flatnonzero(np.diff(failed) > 1) + 1) if len(run) < 4]
+    assert list(gone) == np.concatenate(longest).tolist()
+    assert len(gone) > 150
+    slow = 60.0 * rng.poisson(3, size=4000)  # as many as 0 to 8 counts in a sample
+    for speed in (slow, np.where(k % 1000 < 500, good, 0.0)):
+        assert not len(dropouts(speed))
 
 
 def test_what_a_motor_does_is_no_burst():
