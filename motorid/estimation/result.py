@@ -449,21 +449,13 @@ def constraint_table(fit: Fit, violations: Mapping[str, float] = MappingProxyTyp
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison(Printed):
-    """Fits side by side: errors on their records, held-out errors, how the parameters moved.
-
-    Attributes
-    ----------
-    names : tuple of str
-        ``base + effects`` of each.
-    parameters : dict of str to tuple of (value, std) or None
-        Per parameter, one entry per fit; None where a model lacks it.
-    """
+    """Fits side by side: errors on their records, held-out errors, how the parameters moved."""
 
     fits: tuple[Fit, ...]
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # base + effects of each
     nrmse: tuple[Mapping[str, float], ...]
     validation_nrmse: tuple[Mapping[str, float] | None, ...]
-    parameters: Mapping[str, tuple[tuple[float, float | None] | None, ...]]
+    parameters: Mapping[str, tuple[tuple[float, float | None] | None, ...]]  # (value, std) per fit that has it
 
     def card(self) -> Card:
         """Return errors and parameters side by side."""

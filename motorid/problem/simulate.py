@@ -31,16 +31,10 @@ SETTLES = 4  # times that unknown initial states are sought, each with the sub-s
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A model's answer to one record.
-
-    Attributes
-    ----------
-    outputs : dict of str to ndarray
-        Model outputs at the samples, SI.
-    """
+    """A model's answer to one record."""
 
     experiment: Experiment
-    outputs: Mapping[str, Array]
+    outputs: Mapping[str, Array]  # at the samples, SI
     states: Mapping[str, Array]
 
     def residual(self, channel: str) -> Array:

@@ -30,33 +30,16 @@ def check_level(level: float) -> None:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Covariance(Printed):
-    """What the data say about the unknowns of a fit.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Unknowns: free parameters, then initial states.
-    values : ndarray, shape (k,)
-    matrix : ndarray, shape (k, k)
-        Covariance in physical units; NaN in the rows of what is not determined.
-    status : mapping of str to str
-        ``"determined"``, ``"not determined"``, ``"at its lower limit"`` or ``"at its upper limit"``.
-    positive : tuple of bool
-        Which unknowns cannot be zero or negative.
-    dof : float
-        Effective degrees of freedom of the residuals.
-    colours : mapping of str to Colour
-        Per channel, of the whitened residuals.
-    """
+    """What the data say about the unknowns of a fit, free parameters, then initial states."""
 
     names: tuple[str, ...]
-    values: Array
-    matrix: Array
-    status: Mapping[str, str]
-    positive: tuple[bool, ...]
+    values: Array  # (k,)
+    matrix: Array  # (k, k), in physical units; NaN in the rows of what is not determined
+    status: Mapping[str, str]  # "determined", "not determined", "at its lower limit" or "at its upper limit"
+    positive: tuple[bool, ...]  # which cannot be zero or negative
     method: str
-    dof: float
-    colours: Mapping[str, Colour]
+    dof: float  # effective degrees of freedom of the residuals
+    colours: Mapping[str, Colour]  # per channel, of the whitened residuals
     units: tuple[str, ...]
 
     @cached_property

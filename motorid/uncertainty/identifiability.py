@@ -51,42 +51,20 @@ class WeakDirection:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identifiability(Printed):
-    """What records can tell about parameters, at one point.
-
-    Attributes
-    ----------
-    values, sizes : ndarray, shape (k,)
-        Parameters and what a relative change of one means: the value, or the natural size where it may be zero.
-    t : tuple of ndarray
-        Per run, s.
-    sensitivities : tuple of dict of str to ndarray (N, k)
-        Per run and channel: change over the channel's RMS per relative change of a parameter.
-    singular_values : ndarray, shape (k,)
-        Of the stacked matrix, whitened by the noise, initial states projected out.
-    directions : ndarray, shape (k, k)
-        Rows: right singular vectors.
-    structural_rank : int
-        Largest rank at random points: what any such experiment without noise determines.
-    combinations : tuple of str
-        Products that are determined although their factors are not, e.g. ``"R·J"``.
-    remedies : tuple of str
-        What to fix or to measure for full rank.
-    fitted_std : mapping of str to float or None, optional
-        Standard deviations of the fit, where there is one.
-    """
+    """What records can tell about parameters, at one point."""
 
     names: tuple[str, ...]
-    values: Array
+    values: Array  # (k,), and what a relative change of one means: the value, the natural size where it may be zero
     sizes: Array
     units: tuple[str, ...]
-    t: tuple[Array, ...]
-    sensitivities: tuple[Mapping[str, Array], ...]
-    singular_values: Array
-    directions: Array
-    structural_rank: int
+    t: tuple[Array, ...]  # per run, s
+    sensitivities: tuple[Mapping[str, Array], ...]  # per run and channel, (N, k): over its RMS per relative change
+    singular_values: Array  # (k,), of the stacked matrix, whitened by the noise, initial states projected out
+    directions: Array  # (k, k), rows: right singular vectors
+    structural_rank: int  # largest rank at random points: what any such experiment without noise determines
     weak: tuple[WeakDirection, ...]
-    combinations: tuple[str, ...]
-    remedies: tuple[str, ...]
+    combinations: tuple[str, ...]  # products that are determined although their factors are not, e.g. "R·J"
+    remedies: tuple[str, ...]  # what to fix or to measure for full rank
     fitted_std: Mapping[str, float | None] | None = None
 
     @property
