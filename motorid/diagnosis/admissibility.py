@@ -8,6 +8,7 @@ import scipy
 from motorid.diagnosis.model_comparison import far
 from motorid.diagnosis.thresholds import MATERIAL
 from motorid.display.numbers import listed, number, percent
+from motorid.estimation.fit import leaves_noise
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
 from motorid.numerics.signals import Array, integral, noise_level, quantum, window_slopes
@@ -123,11 +124,12 @@ def _emptied(fit: Fit, added: Effect, before: Fit) -> str:
     """Say so where a sensor's effect does away with a parameter of the motor that the data had determined.
 
     Friction of another kind may well take the place of all of the viscous one; a sensor cannot take the place of an
-    inductance, it only buys its gain there.
+    inductance, it only buys its gain there, unless that is all: a model far from its data determines what is not there.
     """
     if added.balance != "sensor":
         return ""
-    for p, std in zip(before.problem.unknown, before.certainty("white").std, strict=True):
+    known = zip(before.problem.unknown, before.certainty("white").std, strict=True)
+    for p, std in () if leaves_noise(fit) and far(before) else known:
         was, now = (f.values.get(p.name, 0.0) for f in (before, fit))
         told = (fit.std.get(p.name) or np.inf) < KNOWN * now  # small, but not zero: what was missing had made it large
         if p.positive and std is not None and std < KNOWN * was and now < EMPTIED * was and not told:

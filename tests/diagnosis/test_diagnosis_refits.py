@@ -251,6 +251,22 @@ def test_a_parameter_that_was_open_before_may_be_emptied():
     assert "goes to zero" not in objections(emptied, LIBRARY["current_lag"], open_)
 
 
+def test_what_a_model_far_from_its_data_determined_may_be_emptied_by_what_leaves_noise():
+    """A lag of the current that no sample resolves, 12 times as long for the lack of a speed averaged over 22 ms: the
+    average was refused, and a first-order lag beside a shorter average "approximated" it."""
+    motor = mi.dc_motor(R=9.3, L=9e-4, K=0.0111, b=3e-7, J=5.2e-7)
+    t, rng = 1e-3 * np.arange(2000), np.random.default_rng(2)
+    run = mi.Experiment(t, {"v": np.repeat(rng.uniform(-6, 6, 20), 100)}, {"i": 0 * t, "omega": 0 * t})
+    clean = simulate(motor + mi.effects.speed_average(T_a=0.022), run, initial="rest")[0].outputs
+    run = run.with_(outputs={c: y + 0.01 * np.std(y) * rng.normal(size=2000) for c, y in clean.items()})
+    before = mi.fit(mi.dc_motor(), run)
+    after = trial.refit(before, before.model + mi.effects.speed_average, ({"T_a": 0.02},))
+    assert after is not None
+    assert max(after.misfit.values()) < 1.1 < 5 < max(before.misfit.values())
+    emptied = replace(after, values={**after.values, "L": 1e-9})
+    assert "goes to zero" not in objections(emptied, LIBRARY["speed_average"], before)
+
+
 def test_a_late_sensor_leaves_the_motor_its_own_lag():
     """Behind a bent drive curve a motor without inertia, whose speed is 48 ms late, and a brake left noise."""
     run = _run(mi.dc_motor(**TRUE))
