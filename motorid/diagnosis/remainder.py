@@ -404,7 +404,7 @@ class Remainder:
     @property
     def proposed(self) -> bool:
         """Tell whether slopes propose a curve, which need not help, or one is known."""
-        curve = self.form is not None or self._anew is not None or any(self._approximating.values())
+        curve = self.form is not None or bool(self._anew) or any(self._approximating.values())
         return self.kind == "structure" and bool(self.__dict__.get("_best", curve))
 
     def as_effect(self, name: str = "remainder") -> Effect:
@@ -486,7 +486,7 @@ class Remainder:
     def _grown(self) -> Grown | None:
         """The same, as far as it has grown; None where none helps. Raises OutOfTime before there is any."""
         short = (t for root in [self._root or self.fit] for t in _grown_in(_moments(root), root, self.forms))
-        every = _by_turns(*(islice(some, TRIED) for some in (self._tried(), short, _beyond(self._anew))))
+        every = _by_turns(*(islice(some, TRIED) for some in (self._tried(), short, *map(_beyond, self._anew))))
         return _best(self.fit, every, self._held or HeldOut.of(self.fit, None))
 
     @property
@@ -511,12 +511,14 @@ class Remainder:
         yield from _by_turns(_over_zeros(self.fit, self.forms), alone)
 
     @property
-    def _anew(self) -> Fit | None:
-        """The model that the search began with, where the last is far from noise: all found may imitate one thing."""
+    def _anew(self) -> tuple[Fit, ...]:
+        """The model that the search began with, where the last is far from noise: all found may imitate one. Where
+        zeros of the angle are among that, it with these, too."""
         if self._root is None or self._root is self.fit or not far(self.fit):
-            return None
+            return ()
         added = {e.name: e for e in self.fit.model.effects if e.name not in self._root.model.effect_names}
-        return _without(self.fit, added) if any(map(tells_the_zero, added.values())) else self._root
+        zeroed = _without(self.fit, added) if any(map(tells_the_zero, added.values())) else None
+        return (self._root,) if zeroed is None else (zeroed, self._root)
 
 
 def _without(fit: Fit, names: Iterable[str]) -> Fit | None:
