@@ -233,6 +233,22 @@ def test_parts_run_in_before_they_are_judged_so_that_what_was_before_leaves_noth
     assert {w.run_in for p in chosen for w in windows(p, 0.2)} == {0}
 
 
+def test_an_axis_whose_effects_need_its_measured_angle_is_looked_at_in_windows(monkeypatch):
+    """A servo's dead band was "gravity" along the measured angle, for whose lack the first model lost it."""
+    run = _run(mi.dc_motor(**TRUE))
+    own = mi.fit(mi.dc_motor(), run)
+    led = mi.fit(replace((own.model + mi.effects.gravity(mgl=1e-4)), angle_input=True, _systems={}), run, start="model")
+    monkeypatch.setattr(stepwise, "in_windows", Mock(return_value=None))
+    for last, found, looked in ((led, 0.2, True), (own, 0.2, False), (own, 0.9, True)):
+        errors = [SimpleNamespace(held_out={"omega": SimpleNamespace(nrmse=e, misfit=30.0)}) for e in (0.9, found)]
+        path = [SimpleNamespace(fit=fit, key=frozenset(fit.model.effect_names), predictions=error)
+                for fit, error in zip((own, last), errors, strict=True)]
+        stepwise.in_windows.reset_mock()
+        assert stepwise._in_windows(SimpleNamespace(path=path, rounds=())) is None
+        calls = stepwise.in_windows.call_args_list
+        assert any(call.args[0] is own and call.kwargs == {"drifts": True} for call in calls) == looked
+
+
 def test_parts_that_are_nearly_all_are_not_taken():
     t = 1e-3 * np.arange(2500)
     run = mi.Experiment(t, {"v": np.sin(t)}, {"omega": np.sin(t)})

@@ -213,6 +213,27 @@ def test_what_differs_from_run_to_run_is_no_further_part(outside, monkeypatch):
     assert remainder._better_curve(remainder._further(found), found.predictions, held) is None
 
 
+def test_no_curve_tells_a_measured_angle_to_follow_itself(outside, monkeypatch):
+    """A load over the measured angle of a servo "predicted" it to 0.03 %, an inertia that is none beside it."""
+    _, found, _ = outside("cam")
+    curve = Curve(found.best, (Part.of(found.best, found.remainder.form),))
+    assert curve.grown() is not None
+    monkeypatch.setattr(remainder, "copies_the_angle", lambda *_: True)
+    assert curve.grown() is None
+
+
+def test_where_zeros_of_the_angle_were_added_a_curve_is_tried_without_them_too(lab):
+    """A weight on a cord that winds up either way was a spring with another zero in every run: 12.7 % for 0.6."""
+    rng = np.random.default_rng(4)
+    clean = [driven(lab, {"cam": {"A": 2.5e-2}}, w, 400, 2e-3, rng) for w in SLOW[:2]]
+    runs = [record(c, "logger", ANGLE, lab, rng, w) for c, w in zip(clean, SLOW, strict=False)]
+    root = mi.fit(mi.dc_motor(), runs)
+    fit = mi.fit(mi.dc_motor() + mi.effects.spring + mi.effects.PER_RUN["encoder_zero"], runs)
+    assert [f.model.effect_names for f in Remainder("structure", fit, _root=root)._anew] == [("encoder_zero",), ()]
+    sprung = mi.fit(mi.dc_motor() + mi.effects.spring, runs)
+    assert [f.model.effect_names for f in Remainder("structure", sprung, _root=root)._anew] == [()]
+
+
 def test_only_what_promises_more_than_a_part_is_raced_in_its_place(outside, monkeypatch):
     fit, forms = outside("eddy brake")[1].before, [Form("", "torque", on) for on in ("omega", "v", "i", "run", "theta")]
     monkeypatch.setattr(remainder, "_beyond", lambda base: iter([(base, form) for form in forms]))
