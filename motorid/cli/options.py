@@ -69,7 +69,7 @@ class ReadingOptions:
         metavar="S", help="Seconds by which the voltage acts later than its column says.")] = None
     no_spikes: Annotated[bool, _reading(
         "--no-spikes", help="Leave out single samples that stand far from both neighbours, of speed and angle two or "
-        "three in a row too.")] = False
+        "three in a row, jumps that fade and zeros that failed, too.")] = False
     ignore: Annotated[str | None, _reading(metavar="i,theta", help="Measured channels to leave out.")] = None
     force: Force = False
 

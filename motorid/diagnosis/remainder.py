@@ -365,21 +365,12 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class Remainder:
-    """What a model leaves.
+    """What a model leaves."""
 
-    Attributes
-    ----------
-    kind : {"noise", "fluctuation", "structure"}
-        ``fluctuation``: more than noise, unpredictable; ``structure``: predictable, or hidden by what imitates it.
-    fit : Fit
-        Of the model that leaves it.
-    forms : tuple of Form
-        Free forms that by slopes predict something of it, the best first; fitted, the curve may be of others.
-    """
-
+    # "noise", "fluctuation": more than noise, unpredictable; "structure": predictable, or hidden by what imitates it
     kind: str
-    fit: Fit
-    forms: tuple[Form, ...] = ()
+    fit: Fit  # of the model that leaves it
+    forms: tuple[Form, ...] = ()  # that by slopes predict something of it, the best first; fitted, others may
     _held: HeldOut | None = field(default=None, repr=False)
     _root: Fit | None = field(default=None, repr=False)  # of the model that the search began with
     # effects that only approximate the rest, with the form that predicts better in their place, if one does
