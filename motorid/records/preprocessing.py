@@ -150,17 +150,16 @@ def fading(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
 def dropouts(y: Array) -> NDArray[np.intp]:
     """Return which samples read exactly nothing, few in a row, amid others of one sign that all stay far from it:
     readings that failed. A coarse counter reads nothing where it turns slowly."""
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d  # slow to import, and not needed before
+
     seen = np.flatnonzero(np.isfinite(y))
-    here, coarse = y[seen], 10 * quantum(y)
-    edges = np.flatnonzero(np.diff(here == 0, prepend=False, append=False))
-    found = [np.empty(0, int)]
-    for a, b in edges.reshape(-1, 2).tolist():
-        around = here[max(a - BESIDE, 0):b + BESIDE]
-        around = around[around != 0]
-        low, middle = np.quantile(np.sort(around * np.sign(np.median(around))), [0.02, 0.5]) if len(around) else (0, 0)
-        if b - a <= LONGEST and 0 < a < b < len(here) and low > 0.3 * middle > 0.3 * coarse:
-            found.append(seen[a:b])
-    return np.concatenate(found)
+    zero, size = y[seen] == 0, 2 * BESIDE + 1
+    least, most = minimum_filter1d(np.where(zero, np.inf, y[seen]), size), maximum_filter1d(
+        np.where(zero, -np.inf, y[seen]), size)
+    low, high = np.where(least > 0, least, -most), np.where(least > 0, most, -least)  # in the direction of motion
+    edges = np.flatnonzero(np.diff(zero, prepend=False, append=False)).reshape(-1, 2)
+    few = np.repeat(np.diff(edges)[:, 0] <= LONGEST, np.diff(edges)[:, 0])
+    return seen[zero][few & ((low > 0.2 * high) & (high > 10 * quantum(y)) & np.isfinite(high))[zero]]
 
 
 def spikes(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
