@@ -370,7 +370,7 @@ class Remainder:
     # "noise", "fluctuation": more than noise, unpredictable; "structure": predictable, or hidden by what imitates it
     kind: str
     fit: Fit  # of the model that leaves it
-    forms: tuple[Form, ...] = ()  # that by slopes predict something of it, the best first; fitted, others may
+    forms: tuple[Form, ...] = ()  # that by slopes predict some of it, the best first; its curve may be of others
     _held: HeldOut | None = field(default=None, repr=False)
     _root: Fit | None = field(default=None, repr=False)  # of the model that the search began with
     # effects that only approximate the rest, with the form that predicts better in their place, if one does

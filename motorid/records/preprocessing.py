@@ -17,7 +17,7 @@ PEAK = 6  # samples after a jump of the voltage, where the current has a peak
 FEWEST = 20  # finite samples among which one can stand out
 LEAST, MOST = 3, 0.05  # spikes of a channel: fewer may be chance, a larger share is no accident
 MOST_LOST = 0.2  # share of readings that failed
-BESIDE = 25  # samples before and after a reading that failed
+AROUND = 25  # samples before and after a reading that failed, which it stands out of
 BEYOND = 1.5  # times the largest value else, which no blow gives a mass
 LONGEST = 3  # samples of a burst: a logger's line or two that are lost; longer ones may be a blow
 
@@ -99,7 +99,7 @@ def delayed(t: Array, v: Array, hold: str, seconds: float, before: float) -> Arr
 
 def without_spikes(t: Array, y: Array, v: Array, inert: bool = False) -> Array:
     """Return an output with samples that no motor makes marked as missing, the same array for none: single ones, of
-    which a few may be chance; of what is `inert`, short bursts too. A large share is no accident: it is left."""
+    which a few may be chance; of what is `inert`, bursts, what fades and zeros too. A large share is no accident."""
     if np.isfinite(y).sum() < FEWEST:
         return y
     at = at if len(at := spikes(t, y, v)) >= LEAST else at[:0]
@@ -153,7 +153,7 @@ def dropouts(y: Array) -> NDArray[np.intp]:
     from scipy.ndimage import maximum_filter1d, minimum_filter1d  # slow to import, and not needed before
 
     seen = np.flatnonzero(np.isfinite(y))
-    zero, size = y[seen] == 0, 2 * BESIDE + 1
+    zero, size = y[seen] == 0, 2 * AROUND + 1
     least, most = minimum_filter1d(np.where(zero, np.inf, y[seen]), size), maximum_filter1d(
         np.where(zero, -np.inf, y[seen]), size)
     low, high = np.where(least > 0, least, -most), np.where(least > 0, most, -least)  # in the direction of motion
