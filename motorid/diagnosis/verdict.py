@@ -99,7 +99,7 @@ def _nearest(rungs: Sequence[Rung], grades: Sequence[Grade],
     nearest = [g for g in grades if shares.get(g.effect, 0.0) == share]
     if share <= (0.0 if any(g.form for g in grades) else MOST):
         return "", share, []
-    said = " with ".join(_described(rungs[-1].fit, g.effect) for g in nearest)
+    said = " with ".join(_described(rungs[-1].fit, g.effect) for g in nearest) + _alike(ranking, nearest, grades)
     removes = "removes" if len(nearest) == 1 else "remove"
     if any(OPEN in text for text in (said, *(g.why for g in nearest))):
         others = [(rarity(c.effect), drop, _described(c.fit, c.effect)) for c in ranking
@@ -112,6 +112,15 @@ def _nearest(rungs: Sequence[Rung], grades: Sequence[Grade],
         elif any(g.form for g in grades):
             return "", share, []
     return f"{said}, which {removes} {percent(share, 2)} of the squared error", share, nearest
+
+
+def _alike(ranking: Sequence[Candidate], nearest: Sequence[Grade], grades: Sequence[Grade]) -> str:
+    """Return what leaves hardly more of the squared error than the nearest effect did alone, the commonest first."""
+    left = {c.effect: 1 - c.refit_drop for c in ranking if c.refit_drop is not None and ", but " not in c.reason}
+    most = (1 + TRIFLE) * left.get(nearest[0].effect, 0.0) if len(nearest) == 1 else 0.0
+    others = sorted(left.keys() - {g.effect for g in grades}, key=lambda name: (rarity(name), name))
+    alike = [name for name in others if left[name] < most][:3]
+    return f" (as near: {listed(alike, 'or')})" if alike else ""
 
 
 def approximations_text(grades: Sequence[Grade], what: str = "it") -> str:

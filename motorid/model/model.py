@@ -28,17 +28,6 @@ LINEAR_DOCS = {"g": "force per unit of the command; fixed", "J": "moving mass",
 class Model(Shown):
     """A base motor and its effects; every change returns a copy.
 
-    Attributes
-    ----------
-    base : str
-        ``"dc_motor"`` or ``"torque_driven"``.
-    parameters : dict of str to Parameter
-        Of the base and all effects; `sgn_width` appears where an effect uses sgn.
-    axis : {"rotary", "linear"}
-        Linear: the same equations read as mass and force, units shown so.
-    angle_input : bool
-        Effects take the angle from a given signal instead of the model's own state.
-
     Examples
     --------
     >>> model = (mi.dc_motor() + mi.effects.coulomb).fix(L=1e-3).bounded(R=(0.5, 5))
@@ -48,11 +37,11 @@ class Model(Shown):
     ()
     """
 
-    base: str
+    base: str  # "dc_motor" or "torque_driven"
     effects: tuple[Effect, ...] = ()
-    parameters: Mapping[str, Parameter] = field(default_factory=dict)
-    axis: str = "rotary"
-    angle_input: bool = False
+    parameters: Mapping[str, Parameter] = field(default_factory=dict)  # also `sgn_width` where an effect uses sgn
+    axis: str = "rotary"  # or "linear": the same equations read as mass and force, units shown so
+    angle_input: bool = False  # effects take the angle from a given signal instead of the model's own state
     _systems: dict[Any, System] = field(default_factory=dict, repr=False)
 
     def __add__(self, other: Effect) -> Model:

@@ -113,6 +113,22 @@ def test_nearest_is_what_removes_most_of_the_squared_error_by_the_measure_of_the
     assert "Nearest" not in unexplained_text((), rungs[:2], bare[1:], "", remaining)
 
 
+def test_what_is_as_near_is_told_beside_the_nearest(rng):
+    """Steps of one direction: a constant load was the nearest, though dry friction or a dead band do the same."""
+    loaded = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=4e-5, J=3e-5) + mi.effects.constant_load(tau_0=5e-3)
+    t = np.arange(600)
+    fit = mi.fit(loaded, noisy(simulated(2e-3 * t, 6.0 + np.sign(np.sin(0.02 * t)), model=loaded), rng))
+    rungs = [Rung(added, fit, {"omega": e}, None) for added, e in ((None, 0.1), ("constant_load", 0.0179))]
+    grades = [Grade("constant_load", "approximates", "a curve is better", SimpleNamespace(text="a torque"))]
+    ranking = [Candidate(name, 0.5, refit_drop=drop, reason=why) for name, drop, why in (
+        ("stribeck", 0.993, "lowers the error, but tau_s < tau_c"), ("constant_load", 0.968, ""), ("gravity", 0.31, ""),
+        ("driver_dead_band", 0.966, "far behind"), ("coulomb", 0.9675, "far behind"), ("lugre", None, ""))]
+    remaining = SimpleNamespace(adequate=False, hum="", text="Something is missing.")
+    answer = unexplained_text(ranking, rungs, grades, "a torque", remaining)
+    assert "(as near: coulomb or driver_dead_band), which removes 97 % of" in answer
+    assert "as near" not in unexplained_text(ranking[:3], rungs, grades, "a torque", remaining)
+
+
 def test_nearest_is_a_pair_by_what_both_removed_and_what_is_determined(rng):
     """What took an earlier effect's place removed what both do; sizes that are open are no headline beside known ones.
     (EV3: a speed filter for dry friction that differs by direction; a cart: a winding 90 +- 100 K colder for a limit.)
