@@ -88,8 +88,7 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
         misread = _contradicting(found, fit.problem.experiments)
         records = () if driven else fit.problem.experiments  # as they were read
         spent = time.monotonic() - began
-        most = float("inf") if budget is None else max(budget - spent, 0.0)
-        left = 0.0 if misread else min(max(spent, CURVE), most)  # of records to be mended no curve is worth its time
+        left = 0.0 if misread else min(max(spent, CURVE), float("inf") if budget is None else max(budget - spent, 0.0))
         return _told(found, misread, " ".join(w for w in (twice, driven) if w), validate is not None, records, left)
 
 

@@ -82,15 +82,19 @@ def rosenbrock_step(system: System, x, u0, u1, h, p):
 
 
 def _elimination_order(w: ca.SX) -> list[int]:
-    """Return the order of the states that fills W least (Markowitz, Management Science 3(3), 1957): what only remembers
-    the motor goes before it. The others keep their order."""
-    filled, left, order = np.array(ca.DM(w.sparsity(), 1)) != 0, list(range(w.shape[0])), []
-    while left:
-        fill = {k: (filled[left, k].sum() - 1) * (filled[k, left].sum() - 1) for k in left if filled[k, k]}
-        order.append(k := min(fill, key=fill.__getitem__, default=left[0]))
-        left.remove(k)
-        filled[np.ix_(left, left)] |= np.outer(filled[left, k], filled[k, left])
-    return order
+    """Return the order of the states that fills W least (Markowitz, Management Science 3(3), 1957), their own if that
+    fills no more: what only remembers the motor goes before it."""
+    pattern, orders = np.array(ca.DM(w.sparsity(), 1)) != 0, []
+    for freely in (False, True):
+        filled, left, order = pattern.copy(), list(range(len(pattern))), list[int]()
+        while left:
+            fill = {k: (filled[left, k].sum() - 1) * (filled[k, left].sum() - 1) for k in left if filled[k, k]}
+            k = min(fill, key=fill.__getitem__, default=left[0]) if freely else left[0]
+            order.append(k)
+            left.remove(k)
+            filled[np.ix_(left, left)] |= np.outer(filled[left, k], filled[k, left])
+        orders.append((filled.sum(), order))
+    return min(orders, key=lambda entry: entry[0])[1]
 
 
 def _lu(w: ca.SX) -> list[list[ca.SX]]:

@@ -105,8 +105,7 @@ def without_spikes(t: Array, y: Array, v: Array, inert: bool = False) -> Array:
     at = at if len(at := spikes(t, y, v)) >= LEAST else at[:0]
     if inert and np.ptp(v) > 0:  # a step shows how fast the motor is
         at = np.union1d(np.union1d(at, bursts(t, y, v)), fading(t, y, v))
-    if len(at) > MOST * len(t):
-        at = at[:0]
+    at = at if len(at) <= MOST * len(t) else at[:0]
     lost = dropouts(y) if inert else at[:0]
     at = np.union1d(at, lost) if LEAST <= len(lost) <= MOST_LOST * len(t) else at
     if not len(at):
@@ -150,12 +149,10 @@ def fading(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
 def dropouts(y: Array) -> NDArray[np.intp]:
     """Return which samples read exactly nothing, few in a row, amid others of one sign that all stay far from it:
     readings that failed. A coarse counter reads nothing where it turns slowly."""
-    from scipy.ndimage import maximum_filter1d, minimum_filter1d  # slow to import, and not needed before
-
     seen = np.flatnonzero(np.isfinite(y))
     zero, size = y[seen] == 0, 2 * AROUND + 1
-    least, most = minimum_filter1d(np.where(zero, np.inf, y[seen]), size), maximum_filter1d(
-        np.where(zero, -np.inf, y[seen]), size)
+    least = scipy.ndimage.minimum_filter1d(np.where(zero, np.inf, y[seen]), size)
+    most = scipy.ndimage.maximum_filter1d(np.where(zero, -np.inf, y[seen]), size)
     low, high = np.where(least > 0, least, -most), np.where(least > 0, most, -least)  # in the direction of motion
     edges = np.flatnonzero(np.diff(zero, prepend=False, append=False)).reshape(-1, 2)
     few = np.repeat(np.diff(edges)[:, 0] <= LONGEST, np.diff(edges)[:, 0])
