@@ -56,7 +56,7 @@ class _PlainHelp:
 
     def get_params(self, ctx: Any) -> list[Any]:
         """See click."""
-        params: list[Any] = super().get_params(ctx)  # type: ignore[misc]  # a mixin
+        params: list[Any] = super().get_params(ctx)  # type: ignore[misc]  # of the click class it is mixed into
         for p in params:
             if p.param_type_name == "argument":
                 p.display_type_rich = lambda ctx: ""

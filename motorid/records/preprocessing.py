@@ -137,7 +137,7 @@ def fading(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
     here, level = y[seen], np.cumsum(np.abs(np.diff(v, prepend=v[0])) > 0.02 * np.ptp(v))[seen]
     sizes, found = np.abs(np.diff(here)), [np.empty(0, int)]
     near = 3 * max(float(np.quantile(sizes, 0.9)), noise_level(y, t))
-    for a in np.flatnonzero(sizes > 4 * near).tolist():
+    for a in np.flatnonzero((sizes > 4 * near) & (np.abs(here[1:]) > BEYOND * np.quantile(np.abs(here), 1 - MOST))):
         away = np.abs(here[a + 1:a + 1 + int(MOST * len(here))] - here[a])
         back = int(np.argmax(away < max(near, 0.02 * away[0])))  # 0: never
         if back > 1 and level[a + 1 + back] == level[a] and np.all(np.diff(away[:back]) < near):

@@ -392,7 +392,7 @@ def test_every_command_that_fits_takes_all_of_fits_options():
     group = app
     from typer.main import get_command
 
-    commands = get_command(group).commands  # type: ignore[attr-defined]
+    commands = get_command(group).commands  # type: ignore[attr-defined]  # Typer makes a group of several
     options = {name: {o for p in c.params for o in p.opts} for name, c in commands.items()}
     shared = {"--effects", "--fix", "--set", "--drive", "--solver", "--formulation", "--current-limit",
               "--engine", "--columns", "--units", "--effects-from", "--json"}

@@ -189,7 +189,7 @@ def test_what_is_wrong_of_a_recording_is_not_blamed_on_the_port(wrong, says, tmp
     with pytest.raises(mi.MotoridError, match=says):
         mi.record(mi.virtual_bench("coulomb"), tmp_path / "run.csv", **{"excite": "step:1:0.05", **wrong})
     with pytest.raises(mi.UsageError, match="port takes"):
-        mi.record(3, tmp_path / "other.csv")  # type: ignore[arg-type]
+        mi.record(3, tmp_path / "other.csv")  # type: ignore[arg-type]  # the mistake itself
 
 
 def test_an_error_of_the_callers_own_stays_what_it_is():

@@ -182,7 +182,7 @@ def test_a_journal_that_is_none_is_left_alone_and_a_damaged_one_goes_on(tmp_path
 
 def start(*words: object, **options: object) -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, "-m", "motorid", *map(str, words)], stdout=subprocess.PIPE,
-                            stderr=subprocess.PIPE, text=True, **options)  # type: ignore[call-overload]
+                            stderr=subprocess.PIPE, text=True, **options)  # type: ignore[call-overload]  # env and the like
 
 
 @pytest.mark.parametrize("after", [0.4, 2.5])
