@@ -131,9 +131,11 @@ def _parts(run: Experiment, share: float) -> list[Experiment]:
     count = max(1, round(run.n * share / PART))
     if run.n < 2 * PART * count:
         return [run]
-    each = ((a, run.select(slice(max(a - RUN_IN, 0), a + PART))) for a in _telling(run, count))
-    return [part.with_(name=f"{run.name}[{k}]",
-                       meta={**part_meta(run, part), "part of": (run.name, run.n), "judged from": run.t[a]})
+    quiet = run.without_spikes()  # a part shows less of what is usual
+    spikes = {c: run.t[np.isfinite(y) & ~np.isfinite(quiet.outputs[c])] for c, y in run.outputs.items()}
+    each = ((a, run.select(slice(max(a - RUN_IN, 0), a + PART))) for a in _telling(quiet, count))
+    return [part.with_(name=f"{run.name}[{k}]", meta={**part_meta(run, part), "part of": (run.name, run.n),
+                                                      "judged from": run.t[a], "spikes": spikes})
             for k, (a, part) in enumerate(each, 1)]
 
 

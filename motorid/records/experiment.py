@@ -204,12 +204,15 @@ class Experiment(Shown):
 
         Not next to jumps of the voltage, where the motor is quick; at least three, at most 5 % of a channel. Of speed
         and angle, two or three in a row that jump there and back are left out too, what jumps beyond all else and
-        fades, and zeros, up to a fifth, amid what stays far from them: a mass cannot.
+        fades, and zeros, up to a fifth, amid what stays far from them: a mass cannot. Of a part that a diagnosis looks
+        at those of the whole record are.
         """
-        free = "tau_load" not in self.inputs  # a blow of the load may be as short
+        free, known = "tau_load" not in self.inputs, self.meta.get("spikes")  # a blow of the load may be as short
         outputs = {c: preprocessing.without_spikes(self.t, y, self.inputs["v"], inert=free and c != "i")
+                   if known is None else np.where(np.isin(self.t, known.get(c, ())), np.nan, y)
                    for c, y in self.outputs.items()}
-        return self.with_(outputs=outputs) if any(outputs[c] is not y for c, y in self.outputs.items()) else self
+        lost = any(np.isnan(outputs[c]).sum() > np.isnan(y).sum() for c, y in self.outputs.items())
+        return self.with_(outputs=outputs) if lost else self
 
     def _by_parts(self, y: Array, read: Callable[[slice], Array]) -> Array:
         """Return `y` read anew, each part between pauses by itself: nothing of one goes into the next."""

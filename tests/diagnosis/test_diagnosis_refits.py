@@ -8,6 +8,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+import scipy.signal
 from battery.excite import driven, record
 from lab_records import noisy, simulated
 
@@ -231,6 +232,30 @@ def test_parts_run_in_before_they_are_judged_so_that_what_was_before_leaves_noth
     assert all(np.isnan(s.residual("omega")[:s.experiment.run_in]).all() for s in fit.simulations)
     assert fit.problem.n_outputs == 2 * sum(p.n - p.run_in for p in chosen)
     assert {w.run_in for p in chosen for w in windows(p, 0.2)} == {0}
+
+
+def test_what_a_sensor_invents_is_told_by_the_whole_record_also_in_its_parts(rng):
+    """A speed from an angle that wraps, behind a filter: no part of one voltage told that no motor jumps so."""
+    t, k = 1e-3 * np.arange(24000), np.arange(24000)
+    v = np.where(k // 4000 % 2, -6.0, 6.0)
+    speed = 6 * scipy.signal.lfilter([0.02], [1, -0.98], v) + 0.3 * rng.standard_normal(len(t))
+    for at in range(400, 24000, 800):
+        speed[at:at + 20] += 250 * np.exp(-np.arange(20) / 5)
+    whole = mi.Experiment(t, {"v": v}, {"omega": speed}, name="plant")
+    gone = t[np.isnan(whole.without_spikes().outputs["omega"])]
+    chosen = parts.parts_of([whole], 0.25)
+    assert chosen is not None
+    calm = [p for p in chosen if np.ptp(p.inputs["v"]) == 0]
+    assert calm
+    for part in (*calm, *windows(calm[0], 0.5)):
+        told = np.isin(part.t, gone)
+        assert told.any() or part.n < 700
+        assert list(np.isnan(part.without_spikes().outputs["omega"])) == list(told)
+    fit = mi.fit(mi.dc_motor(), chosen)
+    reading = parts.without_spikes(fit)
+    assert reading is not None
+    assert f"{sum(int(np.isin(p.t, gone).sum()) for p in chosen)} samples" in reading.says
+    assert reading.fitted(fit).nrmse["omega"] < 0.02 < fit.nrmse["omega"]
 
 
 def test_an_axis_whose_effects_need_its_measured_angle_is_looked_at_in_windows(monkeypatch):
