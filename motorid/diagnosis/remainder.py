@@ -478,7 +478,7 @@ class Remainder:
         """The same, as far as it has grown; None where none helps. Raises OutOfTime before there is any."""
         short = (t for root in [self._root or self.fit] for t in _grown_in(_moments(root), root, self.forms))
         every = _by_turns(*(islice(some, TRIED) for some in (self._tried(), short, *map(_beyond, self._anew))))
-        return _best(self.fit, every, self._held or HeldOut.of(self.fit, None))
+        return _predicting_most(self.fit, every, self._held or HeldOut.of(self.fit, None))
 
     @property
     def _on_whole(self) -> Remainder | None:
@@ -594,7 +594,7 @@ class Grown(NamedTuple):
 
 
 @one_thread
-def _best(fit: Fit, tried: Iterable[tuple[Curve, Form]], held: HeldOut) -> Grown | None:
+def _predicting_most(fit: Fit, tried: Iterable[tuple[Curve, Form]], held: HeldOut) -> Grown | None:
     """Return the curve, fitted with its model, that predicts most beyond `fit`; None where none does."""
     before, name = held.predictions(fit), _name(fit)
     best = _better_curve(((replace(curve, name=name), form) for curve, form in tried), before, held)
@@ -646,7 +646,7 @@ def _better_curve(tried: Iterable[tuple[Curve, Form]], before: Predictions, held
     with contextlib.suppress(OutOfTime):  # what is tried takes fits to find, too
         for first, form in _race(found, tried, before, held):
             known = any(f.done for f in found.values()) or form.on == "run"  # a size of each run has no grid
-            for grown in () if known else _grown(first, form, False, before, held):
+            for grown in () if known else _growing(first, form, False, before, held):
                 found[first, form, "grid"] = grown
     better = sorted((f for f in found.values() if f.gained.worth_it),
                     key=lambda f: (len(f.curve.fitted.q) if f.curve.fitted else 0, -f.gained.gain))
@@ -672,7 +672,7 @@ def _race(found: dict[Any, Grown], tried: Iterable[tuple[Curve, Form]], before: 
     for key in tried:
         alike = {(c.fit.model.effect_names, f, c.begun is None) for c, f in racing}
         if (key[0].fit.model.effect_names, key[1], key[0].begun is None) not in alike:
-            racing[key] = _grown(*key, True, before, held)
+            racing[key] = _growing(*key, True, before, held)
             if quiet(key, TASTED if found or trial else FEW):
                 return []
     ahead = sorted(found, key=lambda key: -found[key].gained.gain)
@@ -698,7 +698,7 @@ def beside_leaving_noise(last: Node, form: Form, special: Mapping[str, float], h
     smaller, found = _without(last.fit, special), list[tuple[int, FormGain]]()
     for curve in (smaller and _instead(last.fit, smaller, form, special), Curve(last.fit, name=_name(last.fit))):
         if curve and (curve.begun or found or max(special.values()) > TRIFLE):
-            grown = islice(_grown(curve, form, True, last.predictions, held), TASTED if curve.begun else None)
+            grown = islice(_growing(curve, form, True, last.predictions, held), TASTED if curve.begun else None)
             done = ((g, FormGain(form, g.gained, g.predictions, curve.fit is smaller)) for g in grown if g.done)
             found += [(len(g.curve.sizes) + len(curve.fit.q), gain) for g, gain in islice(done, 1)]
     return min(reversed(found), key=lambda entry: entry[0], default=(0, None))[1]
@@ -727,7 +727,7 @@ def _name(fit: Fit) -> str:
     return "remainder" + "_more" * sum(n.startswith("remainder") for n in fit.model.effect_names)
 
 
-def _grown(curve: Curve, form: Form, moved: bool, before: Predictions, held: HeldOut) -> Iterator[Grown]:
+def _growing(curve: Curve, form: Form, moved: bool, before: Predictions, held: HeldOut) -> Iterator[Grown]:
     """Yield a curve with a form more, of ever more functions, as long as these help."""
     best, led = float("-inf"), None
     with contextlib.suppress(*FAILURES):
