@@ -8,6 +8,7 @@ import scipy
 from motorid.diagnosis.model_comparison import far
 from motorid.diagnosis.thresholds import MATERIAL
 from motorid.display.numbers import listed, number, percent
+from motorid.estimation.covariance import UNDETERMINED
 from motorid.estimation.fit import leaves_noise
 from motorid.estimation.result import Fit
 from motorid.model.definition import Effect, Parameter
@@ -70,6 +71,13 @@ def run_through(fit: Fit, added: Effect) -> str:
                 if depth[k[0]] > 0 and far and np.min(omega[k[0] : k[-1] + 2]) > RUNS_ON * np.max(np.abs(omega)):
                     return f"the motor runs on through {p.name} = {number(fit.values[p.name], 3)} {p.unit}"
     return ""
+
+
+def certain(fit: Fit) -> dict[str, float | None]:
+    """Return one standard deviation per parameter; None for a size within two of them from zero: that is no answer."""
+    sizes = {n for n, p in fit.model.parameters.items() if p.positive or p.null == 0}
+    return {n: None if n in sizes and s is not None and s > UNDETERMINED * abs(fit.values[n]) else s
+            for n, s in fit.std.items()}
 
 
 def undetermined(fit: Fit, effect: Effect) -> str:

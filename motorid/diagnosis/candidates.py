@@ -21,11 +21,12 @@ from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, fa
 from motorid.diagnosis.predictive_score import QUICK, Evidence, HeldOut, deciding
 from motorid.diagnosis.refit import LITTLE, STOPPED, GivenUp, Task, completed, hidden_in, led_on, refit, refits, widened
 from motorid.diagnosis.results import Candidate
-from motorid.diagnosis.score_test import Score, pairs_of, rank, uses_angle, with_phase_per_run, with_warm_start
+from motorid.diagnosis.score_test import Score, beside_the_first, pairs_of, rank, with_phase_per_run, with_warm_start
 from motorid.diagnosis.thresholds import MATERIAL
 from motorid.display.numbers import listed
 from motorid.effects import LIBRARY, MEASURED, OTHER, PER_RUN, get
 from motorid.errors import ModelError, otherwise
+from motorid.estimation.angle_orders import uses_angle
 from motorid.estimation.fit import lost, solve
 from motorid.estimation.least_squares import FAILURES, RACE
 from motorid.estimation.result import Fit
@@ -217,13 +218,16 @@ class Search:
         return tasks
 
     def _shortlist(self, node: Node) -> list[Score]:
-        """Return what is worth a refit: the best, what is common and near the best, and what a score cannot show. Far
-        from the records slopes say little, and all that is common is tried; what has no free parameter has no slope; a
-        line in the spectrum over the angle is no accident, however small beside the rest of the misfit."""
+        """Return what is worth a refit: the best and what explains most beside it, what is common and near the best,
+        and what a score cannot show. Far from the records slopes say little, and all that is common is tried; what has
+        no free parameter has no slope; a line in the spectrum over the angle is no accident, however small beside the
+        rest of the misfit."""
         scores, astray, unmet = self.scores(node), lost(node.fit), bool(far(node.fit))
+        other = beside_the_first(deciding(node.fit), scores)
         near = NEAR * max((s.drop for s in scores), default=0.0)
         return [s for k, s in enumerate(scores)
                 if (s.drop > 0 and (k < SHORTLIST or s.stands_out or (s.effect.name in COMMON and s.drop > near)))
+                or s in other
                 or (s.effect.name in self._always and s.shapes) or (astray and s.effect.name in COMMON)
                 or (unmet and not any(p.vary for p in s.effect.parameters))]
 

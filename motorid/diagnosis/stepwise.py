@@ -426,8 +426,11 @@ def _in_windows(found: Climb) -> Fit | None:
 
     A pendulum upright says so only with its weight in the model; detents may be refused as the motor rested in others.
     Where the last model loses a channel, an axis drifts: no force is known so well that its sum is the motion. So it
-    may where a spring draws back what the first one loses: in a position loop that helps, whatever is missing.
+    may where a spring draws back what the first one loses: in a position loop that helps, whatever is missing; but
+    what leaves noise alone on whole records is no matter of chance.
     """
+    if at_noise(found.path[-1]):
+        return None
     first, last = found.path[0].fit, found.path[-1].fit
     refused = [c for c in (found.rounds[-1] if found.rounds else ()) if c.fit is not None and not c.accepted]
     best = max(refused, key=lambda c: c.gain or 0.0, default=None)

@@ -8,6 +8,7 @@ import numpy as np
 
 from motorid.channels import channel_name
 from motorid.diagnosis.adequacy import fine_angle_remark
+from motorid.diagnosis.admissibility import certain
 from motorid.diagnosis.misspecification import IN_ITS_PLACE, Grade
 from motorid.diagnosis.model_comparison import Node, far, rarity, share_removed
 from motorid.diagnosis.results import Adequacy, Candidate, Rung
@@ -15,7 +16,6 @@ from motorid.diagnosis.score_test import Score
 from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL, MOST, TRIFLE, UNCONTESTED
 from motorid.display.numbers import arrow, counted, factor, listed, percent, quantity, with_error
 from motorid.effects import OTHER
-from motorid.estimation.covariance import UNDETERMINED
 from motorid.estimation.result import Fit, parameter_cell
 from motorid.model.model import SHOWN
 from motorid.numerics.autoregression import colour_of
@@ -162,7 +162,7 @@ def _left(last: Fit, remaining: Adequacy, where: str = "") -> str:
 
 
 def _described(fit: Fit, name: str) -> str:
-    effect, std = next(e for e in fit.problem.model.effects if e.name == name), _certain(fit)
+    effect, std = next(e for e in fit.problem.model.effects if e.name == name), certain(fit)
     said = [effect.title if name in effect.title else f"{effect.title} [{name}]"]
     for p in effect.parameters:
         now, sd = fit.problem.model.parameters[p.name], std.get(p.name)
@@ -176,13 +176,6 @@ def _described(fit: Fit, name: str) -> str:
             text += ", the ratio of rpm to rad/s: the speed is probably in rpm"
         said.append(text)
     return ", ".join(said)
-
-
-def _certain(fit: Fit) -> dict[str, float | None]:
-    """Return one standard deviation per parameter; None for a size within two of them from zero: that is no answer."""
-    sizes = {n for n, p in fit.model.parameters.items() if p.positive or p.null == 0}
-    return {n: None if n in sizes and s is not None and s > UNDETERMINED * abs(fit.values[n]) else s
-            for n, s in fit.std.items()}
 
 
 def errors_text(rungs: Sequence[Rung]) -> str:
@@ -239,7 +232,7 @@ def moves(before: Fit, after: Fit) -> str:
     """Say how the motor's own parameters had compensated for what was missing."""
     free = set(before.problem.model.free_names) & set(after.problem.model.free_names)
     base = [n for n in ("R", "L", "K", "b", "J") if n in free]
-    was, is_ = _certain(before), _certain(after)
+    was, is_ = certain(before), certain(after)
     known = [n for n in base if was[n] is not None and is_[n] is not None]
     moved = [n for n in known if abs(after.values[n] / max(before.values[n], 1e-300) - 1) > MOVED]
     units = {n: p.unit for n, p in after.problem.model.parameters.items()}

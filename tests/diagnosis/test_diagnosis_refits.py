@@ -234,6 +234,40 @@ def test_parts_run_in_before_they_are_judged_so_that_what_was_before_leaves_noth
     assert {w.run_in for p in chosen for w in windows(p, 0.2)} == {0}
 
 
+def test_what_stands_behind_all_that_could_explain_one_misfit_is_tried_beside_the_first():
+    """A load of a hoist came seventh, after six ways of a current's lag, and was not refitted: neither was found."""
+    model = mi.dc_motor(R=0.94, L=1.6e-3, K=0.048, b=3e-5, J=8.5e-5)
+    model = model + mi.effects.current_lag(T_i=3e-3) + mi.effects.constant_load(tau_0=5e-3)
+    runs = []
+    for seed in (1, 2):
+        rng, t = np.random.default_rng(seed), 1e-3 * np.arange(1500)
+        blank = mi.Experiment(t, {"v": np.repeat(rng.uniform(-10, 10, 15), 100)}, {"i": 0 * t, "omega": 0 * t})
+        clean = mi.simulate(model, blank, initial="rest")[0].outputs
+        runs.append(blank.with_(outputs={c: y + 0.01 * y.std() * rng.standard_normal(1500) for c, y in clean.items()}))
+    tried = search.Search(mi.fit(mi.dc_motor(), runs), None, search.library(None), search.Stages())
+    ranked = [s.effect.name for s in tried.scores(tried.root)]
+    assert ranked.index("constant_load") >= search.SHORTLIST
+    assert ranked[0] == "current_lag"
+    assert "constant_load" in [s.effect.name for s in tried._shortlist(tried.root)]
+
+
+def test_what_leaves_noise_on_whole_records_is_not_looked_at_in_windows(monkeypatch):
+    """A spring and friction, right and at the noise, were given up for "backlash" of windows: 129 → 1.67 % before."""
+    rests = mi.dc_motor(**TRUE) + mi.effects.spring(k_s=0.02)
+    model = rests + mi.effects.coulomb(tau_c=0.02)
+    t, rng = 1e-3 * np.arange(3000), np.random.default_rng(1)
+    blank = mi.Experiment(t, {"v": np.repeat(rng.uniform(-6, 6, 12), 250)}, {"theta": 0 * t})
+    clean = mi.simulate(model, blank, initial="rest")[0].outputs["theta"]
+    run = blank.with_(outputs={"theta": clean + 0.01 * clean.std() * rng.standard_normal(3000)})
+    kept = held.HeldOut.of(root := mi.fit(mi.dc_motor(), run), run)
+    for last, looked in ((mi.fit(model, run, start="model"), False),
+                         (mi.fit(rests, run, start="model"), True)):
+        monkeypatch.setattr(stepwise, "in_windows", Mock(return_value=None))
+        path = [node_of(root, kept), node_of(last, kept)]
+        assert stepwise._in_windows(SimpleNamespace(path=path, rounds=())) is None
+        assert stepwise.in_windows.called is looked
+
+
 def test_what_a_sensor_invents_is_told_by_the_whole_record_also_in_its_parts(rng):
     """A speed from an angle that wraps, behind a filter: no part of one voltage told that no motor jumps so."""
     t, k = 1e-3 * np.arange(24000), np.arange(24000)

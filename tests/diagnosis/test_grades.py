@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.signal
 from battery.excite import driven, record
 
 import motorid as mi
@@ -24,7 +25,7 @@ from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.admissibility import objections, undetermined
 from motorid.diagnosis.candidates import library
 from motorid.diagnosis.free_forms import Form
-from motorid.diagnosis.misspecification import FormGain, Grade
+from motorid.diagnosis.misspecification import DIFFERENCED, FormGain, Grade, _sure_together
 from motorid.diagnosis.model_comparison import node_of
 from motorid.diagnosis.predictive_score import Evidence, HeldOut, Predictions
 from motorid.diagnosis.results import Candidate
@@ -529,6 +530,35 @@ def test_half_a_sample_that_a_difference_of_counts_is_late_is_no_missing_effect(
     else:
         assert found.effects == ("speed_average",)
         assert "half a sample" not in found.text
+
+
+@pytest.mark.parametrize("lag", [0.0, 3e-3])
+def test_half_a_sample_is_told_where_no_current_keeps_it_apart_from_the_winding(lag):
+    """Of a speed from counts alone a lag of 1.2 ms beside L/R of 0.6 was named; of 0.5 it is beside the true one."""
+    rng, t = np.random.default_rng(1), 1e-3 * np.arange(3000)
+    motor = mi.dc_motor(R=1.2, L=1.5e-3, K=0.04, b=2e-4, J=4.5e-5)
+    blank = mi.Experiment(t, {"v": np.repeat(rng.uniform(-12, 12, 30), 100)}, {"theta": 0 * t})
+    counts = np.round(mi.simulate(motor, blank, initial="rest")[0].outputs["theta"] * 2000 / (2 * np.pi))
+    speed = np.diff(counts, prepend=counts[0]) * 2 * np.pi / 2000 / 1e-3
+    kept = np.exp(-1e-3 / lag) if lag else 0.0
+    read = blank.with_(outputs={"omega": scipy.signal.lfilter([1 - kept], [1, -kept], speed)})
+    fit = mi.fit(mi.dc_motor() + mi.effects.speed_lag, read)
+    assert fit.values["T_w"] > 1e-3
+    assert misspecification._half_a_sample(fit, LIBRARY["speed_lag"]) is (lag == 0)
+
+
+def test_what_is_open_is_no_surer_than_what_only_approximates_beside_it():
+    """A driver that stretches its pulses was "pwm_coast", of open size, beside two effects of impossible size."""
+    run = stepped(mi.dc_motor(R=1.2, L=1e-3, K=0.05, b=2e-4, J=2e-5) + mi.effects.coulomb(tau_c=2e-3), 1, 800, 1e-3,
+                  i=0.02, omega=0.1)
+    fit = mi.fit(mi.dc_motor() + mi.effects.inductance_saturation + mi.effects.coulomb, run)
+    open_, other = Grade("inductance_saturation", "named"), Grade("coulomb", "named")
+    assert _sure_together([open_, other], fit) == [open_, other]
+    for why, grade in ((DIFFERENCED, "named"), ("tau_c < 0", "approximates")):
+        first, second = _sure_together([open_, Grade("coulomb", "approximates", why)], fit)
+        assert (first.grade, second.why) == (grade, why)
+    sure, _ = _sure_together([other, Grade("inductance_saturation", "approximates", "i_sat goes to zero")], fit)
+    assert sure == other
 
 
 @pytest.mark.parametrize(("noise", "objected"), [(0.02, False), (2.5, True)])
