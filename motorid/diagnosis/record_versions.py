@@ -21,7 +21,7 @@ from motorid.channels import channel_name
 from motorid.diagnosis.predictive_score import ROUGH, Predictions, compare, predictions_left_out
 from motorid.diagnosis.refit import RACE
 from motorid.diagnosis.thresholds import MATERIAL
-from motorid.display.numbers import arrow, number
+from motorid.display.numbers import arrow, counted, number
 from motorid.effects import LIBRARY
 from motorid.errors import MotoridError
 from motorid.estimation.continuation import by_continuation
@@ -177,9 +177,9 @@ def parts_remark(fit: Fit) -> str:
         return thin
     share = sum(r.n - r.run_in for r in used) / sum(whole.values())
     seconds = float(np.median([r.t[-1] - r.t[r.run_in] for r in used]))
-    return (f"The records are long: this rests on {len(used)} parts of {seconds:.2g} s, {100 * share:.0f} % of "
-            "the samples, each from a state of its own, so that errors are smaller there than over whole runs; fit the "
-            f"model to all of them. {thin}".rstrip())
+    return (f"The records are long: this rests on {counted(len(used), 'part')} of {seconds:.2g} s, {100 * share:.0f} % "
+            "of the samples, each from a state of its own, so that errors are smaller there than over whole runs; fit "
+            f"the model to all of them. {thin}".rstrip())
 
 
 def _samples(runs: Sequence[Experiment]) -> int:
