@@ -13,6 +13,8 @@ ORDERS = (2, 3, 4, 5, 6)  # of differences
 _SMALLER_HALF = 0.3240277  # mean of |z| over the smaller half, z standard normal: 4·(φ(0) − φ(0.67449))
 _FLOOR = 1e-5  # of the channel's own variation: what a noise-free simulation is given
 FEWEST_FRESH = 20  # measurements of a sensor that is read more often than it measures
+MOST_HELD = 64  # samples for which a sensor is looked at as one that holds its value
+HELD = 30.0  # times the noise that its changes are, squared: 130 and more in a trial, 12 at most in 870 other channels
 _EVEN = 1e-6  # of the interval: samples are evenly spaced if their times wander by less
 _FEW, _MOSTLY = 512, 0.8  # jumps of a first look at a step, and the share of them that must be its multiples
 _REST = 12  # equal samples in a row that count as standstill
@@ -108,6 +110,36 @@ def repeats(y: Array) -> NDArray[np.bool_]:
     again = np.isfinite(y) & np.repeat(lengths < 2 * every, lengths)
     again[changes] = False
     return again
+
+
+def fresh_means(t: Array, y: Array, v: Array) -> Array:
+    """Return `y` (N,) with the mean of every P samples at the first of them, the others missing, where it changes at
+    every P-th alone and all between is noise: a value that is renewed so rarely, behind a converter; else `y`. Jumps
+    with the voltage `v` do not count: what follows that at once is no sensor's."""
+    if len(t) < MOST_HELD * FEWEST_FRESH or not t[-1] - t[0] < 2 * len(t) * (dt := float(np.median(np.diff(t)))):
+        return y
+    place = np.rint((t - t[0]) / dt).astype(int)
+    whole, jumped = np.full(place[-1] + 1, np.nan), np.abs(np.diff(v, prepend=v[0])) > 0.02 * np.ptp(v)
+    whole[place] = y
+    squares = np.diff(whole) ** 2
+    squares[np.clip(np.add.outer(place[jumped], (-1, 0)), 0, len(squares) - 1)] = np.nan
+    for every in range(MOST_HELD, 2, -1):  # a divisor of the true number would do as well
+        change = _means(squares[: len(squares) // every * every].reshape(-1, every).T)
+        at = int(change.argmax())
+        between = float(np.delete(change, at).max())
+        if 0 < HELD * between < change[at]:
+            held = whole[at + 1: at + 1 + (len(whole) - at - 1) // every * every].reshape(-1, every)
+            if _means((held[:, -1:] - held[:, :1]).T ** 2)[0] < 1.5 * between:  # over a hold white noise has no more
+                fresh = np.full(len(whole), np.nan)
+                fresh[at + 1: at + 1 + held.size: every] = _means(held)
+                return fresh[place]
+    return y
+
+
+def _means(y: Array) -> Array:
+    """Return the mean of each row of `y` without NaN, NaN where there is nothing else."""
+    good = np.isfinite(y)
+    return np.where(good, y, 0.0).sum(axis=1) / np.where(good.any(axis=1), good.sum(axis=1), np.nan)
 
 
 def _plausible(jumps: Array, guesses: Array) -> NDArray[np.bool_]:

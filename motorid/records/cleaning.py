@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from motorid.display.numbers import counted
 from motorid.errors import DataError, otherwise
-from motorid.numerics.signals import Array, repeats
+from motorid.numerics.signals import Array, fresh_means, repeats
 from motorid.records.experiment import INPUTS, MIN_SAMPLES, PARTS, Experiment, pauses
 from motorid.records.layout import Layout, Place
 from motorid.records.preprocessing import unwrapped
@@ -56,6 +56,10 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
             outputs[c] = np.where(again, np.nan, y)
             said.append(f"'{places[c].column}' ({c}) was read more often than it was measured: of {len(y)} samples "
                         f"{np.count_nonzero(again)} repeat the one before and do not count.")
+        elif (fresh := fresh_means(t, y, inputs["v"])) is not y:
+            outputs[c] = fresh
+            said.append(f"'{places[c].column}' ({c}) was read more often than it was measured, behind noise: of "
+                        f"{len(y)} samples {np.count_nonzero(np.isfinite(fresh))} means of what repeats count.")
     extra = {c: a[rows] for c, a in columns.items() if c not in used}
     if set(texts) - used:
         said.append(f"left out columns of text: {', '.join(sorted(set(texts) - used))}.")
