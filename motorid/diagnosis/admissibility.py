@@ -80,11 +80,14 @@ def certain(fit: Fit) -> dict[str, float | None]:
             for n, s in fit.std.items()}
 
 
-def undetermined(fit: Fit, effect: Effect) -> str:
-    """Say which parameters of an effect the records leave open, as voltages too; empty for none."""
-    found = [p.name for p in effect.parameters if fit.problem.model.parameters[p.name].vary and not p.per_run
-             and fit.std[p.name] is None and f"{p.name}_voltage" not in fit.determined]
-    return f"{listed(found)} {'are' if found[1:] else 'is'} not determined, and the rest is not noise" if found else ""
+def undetermined(fit: Fit, effect: Effect, wholly: bool = False) -> str:
+    """Say which parameters of an effect the records leave open, as voltages too, `wholly` only if those are all that it
+    has; empty for none."""
+    own = [p.name for p in effect.parameters if fit.problem.model.parameters[p.name].vary]
+    std = certain(fit) if wholly else fit.std
+    found = [n for n in own if n not in fit.per_run and std[n] is None and f"{n}_voltage" not in fit.determined]
+    said = f"{listed(found)} {'are' if found[1:] else 'is'} not determined"
+    return "" if not found or (wholly and found != own) else said if wholly else f"{said}, and the rest is not noise"
 
 
 def _blurred(fit: Fit, added: Effect) -> str:

@@ -6,15 +6,14 @@ nonparametric one outdoes is not the thing itself (Härdle & Mammen, Ann. Statis
 """
 
 import contextlib
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from motorid.channels import CHANNELS, channel_name
 from motorid.diagnosis import free_forms, predictive_score
-from motorid.diagnosis.admissibility import certain, objections
+from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.free_forms import Form, Linear, Span
 from motorid.diagnosis.model_comparison import Node, evidence, far, share_of
 from motorid.diagnosis.predictive_score import QUICK, Evidence, Predictions, compare
@@ -33,7 +32,6 @@ from motorid.records.checks import current_limit
 
 LIMITER = "driver_current_limit"
 IN_ITS_PLACE = "{}, which the library lacks, predicts better in its place"
-NOT_DETERMINED, AND_MORE = "{} {} not determined", ", and the rest is not noise"
 AS_LATE = 4.0  # half samples: what is later is late by itself
 DIFFERENCED = "the speed reads half a sample late, as a difference of counts does"
 LATENESS = {"speed_lag": 1.0, "speed_delay": 1.0, "speed_average": 0.5}  # mean, of the time of these effects
@@ -236,7 +234,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
                 why = f"it removes {most} the squared error, and the rest is not noise"
         kind = "approximates" if why else "group" if rivals.get(e.name) else "named"
         found.append(Grade(e.name, kind, why, form))
-    return _no_surer_than_what_they_act_on(tuple(_sure_together(found, last.fit)), last.fit)
+    return _no_surer_than_what_they_act_on(tuple(found), last.fit)
 
 
 def _no_surer_than_what_they_act_on(grades: tuple[Grade, ...], fit: Fit) -> tuple[Grade, ...]:
@@ -286,41 +284,20 @@ def _insignificant(last: Node, effect: Effect, structure: bool, root: Node,
     sizes = [p.name for p in own if p.null == 0]
     found = [(fit.values[n], fit.std[n]) for n in sizes]
     found += [(own["value"], own["std"]) for n in sizes for own in fit.per_run.get(n, {}).values()]
-    found += [(q.value, q.std) for n in sizes if (q := _as_voltages(fit).get(f"{n}_voltage")) is not None]
+    torques = {} if {"i", "omega"} <= {*fit.problem.outputs} else fit.determined  # K stays open, and every torque
+    found += [(q.value, q.std) for n in sizes if (q := torques.get(f"{n}_voltage")) is not None]
     if sizes and not any(std is None or STANDARD_ERRORS * std < abs(value) for value, std in found):
         smaller = without(effect.name)  # deviations are of slopes, and zero may be far from where these hold
         if smaller is None or evidence(smaller, last).fall < PLAIN:
             return f"{listed(sizes)} could as well be zero, within two standard deviations"
-    if free := _open(fit, effect, fit.std):
+    free = [p.name for p in own if not sizes or p.name in sizes]
+    known = any(fit.std[n] is not None or f"{n}_voltage" in torques for n in free) or any(p.per_run for p in own)
+    if free and not known:
         more = structure or bool(far(fit))  # than noise
         smaller = without(effect.name) if sizes and not more and far(root.fit) else None
         if more or not far(root.fit) or (smaller is not None and evidence(smaller, last).fall < PLAIN):
-            return f"{NOT_DETERMINED.format(listed(free), 'are' if free[1:] else 'is')}{AND_MORE * more}"
+            return f"{listed(free)} {'are' if free[1:] else 'is'} not determined{', and the rest is not noise' * more}"
     return ""
-
-
-def _open(fit: Fit, effect: Effect, std: Mapping[str, float | None]) -> list[str]:
-    """Return the sizes of an effect, its other parameters where it has none, if none has a standard deviation, as a
-    voltage or in any run either."""
-    own = [p for p in effect.parameters if fit.problem.model.parameters[p.name].vary]
-    free = [p.name for p in own if p.null == 0] or [p.name for p in own]
-    known = any(std[n] is not None or f"{n}_voltage" in _as_voltages(fit) for n in free)
-    return [] if known or any(p.per_run for p in own) else free
-
-
-def _as_voltages(fit: Fit) -> Mapping[str, Any]:
-    """Return the torques that are determined as voltages, where those are all that is: K stays open."""
-    return {} if {"i", "omega"} <= {*fit.problem.outputs} else fit.determined
-
-
-def _sure_together(grades: list[Grade], fit: Fit) -> list[Grade]:
-    """Return grades where no effect whose sizes are all open is surer than others beside it: of a model that leaves
-    noise with what is not physical, or stands in for something else, each part may stand in for it, too."""
-    if all(g.grade != "approximates" or g.why == DIFFERENCED for g in grades):
-        return grades
-    free = {e.name: found for e in fit.model.effects if (found := _open(fit, e, certain(fit)))}
-    return [replace(g, grade="approximates", why=NOT_DETERMINED.format(listed(n), "are" if n[1:] else "is"))
-            if g.grade != "approximates" and (n := free.get(g.effect)) else g for g in grades]
 
 
 def _half_a_sample(fit: Fit, effect: Effect) -> bool:

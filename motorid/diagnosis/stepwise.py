@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from motorid.channels import worded
+from motorid.diagnosis import misspecification
 from motorid.diagnosis import record_versions as versions
 from motorid.diagnosis.adequacy import following, judge_adequacy, within_noise
 from motorid.diagnosis.admissibility import run_through, undetermined
@@ -197,12 +198,15 @@ def _beside_curves(found: Climb) -> Climb:
 
 def _sure_to_the_end(found: Climb) -> Climb:
     """Return a climb in which stops that the motor runs through are named no more; nor, where more than noise is left,
-    a law that the records do not show whole: a free parameter makes it fit what has another shape."""
-    fit = found.path[-1].fit
+    a law that the records do not show whole: a free parameter makes it fit what has another shape. Nor, beside what
+    only approximates, one of which they show nothing: that is as likely to stand in for something else."""
+    fit, grades = found.path[-1].fit, found.grades
     more = not found.remaining.adequate or bool(far(fit))
-    told = {e.name: run_through(fit, e) or (undetermined(fit, e) if more else "") for e in fit.model.effects}
+    half = any(g.grade == "approximates" and g.why != misspecification.DIFFERENCED for g in grades)
+    told = {e.name: run_through(fit, e) or (undetermined(fit, e, not more) if more or half else "")
+            for e in fit.model.effects}
     return replace(found, grades=tuple(g if g.grade == "approximates" or not told[g.effect] else Grade(
-        g.effect, "approximates", told[g.effect]) for g in found.grades))
+        g.effect, "approximates", told[g.effect]) for g in grades))
 
 
 def _sure_alone(search: Search, best: Node, grades: tuple[Grade, ...]) -> tuple[Grade, ...]:

@@ -25,11 +25,11 @@ from motorid.diagnosis.adequacy import adequacy
 from motorid.diagnosis.admissibility import objections, undetermined
 from motorid.diagnosis.candidates import library
 from motorid.diagnosis.free_forms import Form
-from motorid.diagnosis.misspecification import DIFFERENCED, FormGain, Grade, _sure_together
+from motorid.diagnosis.misspecification import FormGain, Grade
 from motorid.diagnosis.model_comparison import node_of
 from motorid.diagnosis.predictive_score import Evidence, HeldOut, Predictions
 from motorid.diagnosis.results import Candidate
-from motorid.diagnosis.stepwise import _outdoing
+from motorid.diagnosis.stepwise import Climb, _outdoing, _sure_to_the_end
 from motorid.effects import LIBRARY
 
 HIDDEN = {"coulomb": {"tau_c": 8e-3}}
@@ -552,13 +552,17 @@ def test_what_is_open_is_no_surer_than_what_only_approximates_beside_it():
     run = stepped(mi.dc_motor(R=1.2, L=1e-3, K=0.05, b=2e-4, J=2e-5) + mi.effects.coulomb(tau_c=2e-3), 1, 800, 1e-3,
                   i=0.02, omega=0.1)
     fit = mi.fit(mi.dc_motor() + mi.effects.inductance_saturation + mi.effects.coulomb, run)
-    open_, other = Grade("inductance_saturation", "named"), Grade("coulomb", "named")
-    assert _sure_together([open_, other], fit) == [open_, other]
-    for why, grade in ((DIFFERENCED, "named"), ("tau_c < 0", "approximates")):
-        first, second = _sure_together([open_, Grade("coulomb", "approximates", why)], fit)
+    named, other = Grade("inductance_saturation", "named"), Grade("coulomb", "named")
+
+    def told(*grades):
+        path, remaining = (SimpleNamespace(fit=fit),), SimpleNamespace(adequate=True)
+        return _sure_to_the_end(Climb(None, path, (), (), "", None, remaining, grades=grades)).grades
+
+    assert told(named, other) == (named, other)
+    for why, grade in ((misspecification.DIFFERENCED, "named"), ("tau_c < 0", "approximates")):
+        first, second = told(named, Grade("coulomb", "approximates", why))
         assert (first.grade, second.why) == (grade, why)
-    sure, _ = _sure_together([other, Grade("inductance_saturation", "approximates", "i_sat goes to zero")], fit)
-    assert sure == other
+    assert told(other, Grade("inductance_saturation", "approximates", "i_sat goes to zero"))[0] == other
 
 
 @pytest.mark.parametrize(("noise", "objected"), [(0.02, False), (2.5, True)])
