@@ -26,7 +26,7 @@ from motorid.diagnosis.thresholds import MATERIAL
 from motorid.display.numbers import listed
 from motorid.effects import LIBRARY, MEASURED, OTHER, PER_RUN, get
 from motorid.errors import ModelError, otherwise
-from motorid.estimation.angle_orders import uses_angle
+from motorid.estimation.angle_orders import shows_turns, uses_angle
 from motorid.estimation.fit import lost, solve
 from motorid.estimation.least_squares import FAILURES, RACE
 from motorid.estimation.result import Fit
@@ -116,7 +116,10 @@ class Search:
         stages.at("looking at the misfit")
         self.held = HeldOut.of(fit, validate)
         law = fit.model.base != "dc_motor" or own_levels(fit.problem.experiments)  # a torque needs no supply
-        self.effects = [e for e in effects if not (law and e.name in PER_RUN and e.balance == "voltage")]
+        self.whole = {*LIBRARY} <= {e.name for e in effects}
+        turns = shows_turns(fit)  # what passes by between samples takes thousands of steps, and none of these shows it
+        self.effects = [e for e in effects if not (law and e.name in PER_RUN and e.balance == "voltage")
+                        and (turns or not any(p.periodic for p in e.parameters))]
         self.stages, self.map, self.stopped = stages, stages.map, ""
         self.root = node_of(fit, self.held)
         self._scores: dict[frozenset[str], list[Score]] = {}

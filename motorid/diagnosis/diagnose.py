@@ -24,7 +24,7 @@ from motorid.diagnosis.remainder import Remainder
 from motorid.diagnosis.results import Adequacy, Diagnosis, Ladder
 from motorid.diagnosis.stepwise import Climb, explored, ladder_of
 from motorid.display.numbers import listed, number
-from motorid.effects import LIBRARY, OTHER
+from motorid.effects import OTHER
 from motorid.errors import MotoridError, OutOfTime, at_least, numbers_told, otherwise
 from motorid.estimation.result import Fit, checked
 from motorid.model.definition import Effect
@@ -158,7 +158,7 @@ def _told(found: Climb, misread: str, driven: str, validated: bool, records: Seq
         verdict, where = "unexplained", missing.where
         answer = words.unexplained_text(ranking, ladder.rungs, graded, like.text if like else "", remaining,
                                         words.curve_text(ladder.rungs, left.errors),
-                                        whole={*LIBRARY} <= {e.name for e in found.search.effects},
+                                        whole=found.search.whole,
                                         done=bool(found.rounds) and not found.stopped)
         judged, known = (judged, []) if len(found.path) > 1 else (remaining, [remaining.text])
         details = [*known, missing.text, words.rises_text(ladder.rungs)]

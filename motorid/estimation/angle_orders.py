@@ -69,13 +69,18 @@ class Spectrum:
 def highest_order(tangent: Tangent) -> int:
     """Highest order that the samples can show: less than a period per sample for a part of the motion. Beyond half a
     period the samples alias, but along a measured angle each order still has its own pattern."""
-    moving = _moving(tangent)
+    moving = _moving(tangent.fit)
     return int(np.clip(1.8 * np.pi / np.quantile(moving, SLOW_PART), 0, HIGHEST)) if moving.size else 0
 
 
-def _moving(tangent: Tangent) -> Array:
+def shows_turns(fit: Fit) -> bool:
+    """Tell whether a part of the motion, if known, is so slow that samples show what comes once a turn."""
+    return bool(np.quantile(moving, SLOW_PART) < 1.8 * np.pi) if (moving := _moving(fit)).size else True
+
+
+def _moving(fit: Fit) -> Array:
     """Changes of the angle per sample, where there are any."""
-    steps = np.concatenate([np.abs(np.diff(angle_signal(r))) for r in tangent.fit.problem.experiments])
+    steps = np.concatenate([np.abs(np.diff(angle_signal(r))) for r in fit.problem.experiments])
     return steps[steps > 1e-6 * max(steps.max(initial=0.0), 1e-300)]
 
 
@@ -285,7 +290,7 @@ def _order_search(tangent: Tangent) -> _OrderSearch:
     answers = [replace(answer, c=answer.c * run.weights[None, :, None])
                for answer, run in zip(responses(tangent.fit), tangent.fit.problem.measured, strict=True)]
     # Up to which change of the angle per sample each order is looked for; 0 where it would be an alias.
-    orders, counted = np.arange(1.0, highest_order(tangent) + 1), np.sort(_moving(tangent))
+    orders, counted = np.arange(1.0, highest_order(tangent) + 1), np.sort(_moving(tangent.fit))
     sure, some = (np.searchsorted(counted, part / orders, side="right") for part in (QUARTER, np.pi))
     slow = np.where(some > SLOW_PART * counted.size, np.pi / orders, 0.0)
     slow = np.where(sure > max(SAMPLES, SURE_PART * counted.size), QUARTER / orders, slow)

@@ -113,6 +113,6 @@ def collapsed_again(problem: Problem, fit: Fit) -> Problem:
     model, gain = restored(fit, fit.model), GAIN * _deviation(fit.problem, fit.residuals) ** 2
     for name in (n for n, p in model.parameters.items() if p.value != fit.model.parameters[n].value):
         other = problem.start_at({name: fit.values[name]})
-        if cost_at(other) < cost_at(problem) + gain:
+        if cost_at(other.within_worth()) < cost_at(problem.within_worth()) + gain:
             problem = other
     return problem

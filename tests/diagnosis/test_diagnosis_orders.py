@@ -7,6 +7,7 @@ import pytest
 from battery.excite import driven, record
 
 import motorid as mi
+from motorid.diagnosis import candidates
 from motorid.estimation import angle_orders as orders
 from motorid.estimation.linearisation import Response, Tangent
 from motorid.numerics.autoregression import ORDER, Whitening
@@ -96,3 +97,19 @@ def test_a_piece_of_a_record_too_short_to_tell_an_order_does_no_harm(rng):
         runs.append(blank.with_(outputs={"omega": omega + rng.normal(0, 0.3, n)}))
     found = mi.diagnose(mi.fit(mi.dc_motor(), runs), effects=["coulomb", "cogging", "encoder_zero"])
     assert found.effects == ("coulomb",)
+
+
+@pytest.mark.parametrize("every", [1, 50])
+def test_what_comes_once_a_turn_is_sought_where_samples_show_a_turn(every, rng):
+    """Settled speeds of a wheel, eight turns from row to row: ten minutes went into a cogging that no row could show."""
+    t = 0.01 * np.arange(20000)
+    motor = mi.dc_motor(R=1.0, L=1e-3, K=0.05, b=1e-4, J=1e-4)
+    blank = mi.Experiment(t, {"v": np.repeat(rng.uniform(2, 10, 100), 200)}, {"omega": 0 * t})
+    clean = mi.simulate(motor, blank, initial="rest")[0].outputs["omega"]
+    run = blank.with_(outputs={"omega": clean + rng.normal(size=len(t))}).decimate(every)
+    fit = mi.fit(mi.dc_motor(), run)
+    search = candidates.Search(fit, None, candidates.library(None), candidates.Stages())
+    periodic = {e.name for e in search.effects if any(p.periodic for p in e.parameters)}
+    assert ({"cogging", "gravity", "torque_ripple"} <= periodic) == orders.shows_turns(fit) == (every == 1)
+    assert {"coulomb", "spring", "end_stop"} <= {e.name for e in search.effects}
+    assert search.whole
