@@ -101,7 +101,7 @@ def test_a_piece_of_a_record_too_short_to_tell_an_order_does_no_harm(rng):
 
 @pytest.mark.parametrize("every", [1, 50])
 def test_what_comes_once_a_turn_is_sought_where_samples_show_a_turn(every, rng):
-    """Settled speeds of a wheel, eight turns from row to row: ten minutes went into a cogging that no row could show."""
+    """Settled speeds of a wheel, eight turns from row to row: ten minutes went into a cogging that no row shows."""
     t = 0.01 * np.arange(20000)
     motor = mi.dc_motor(R=1.0, L=1e-3, K=0.05, b=1e-4, J=1e-4)
     blank = mi.Experiment(t, {"v": np.repeat(rng.uniform(2, 10, 100), 200)}, {"omega": 0 * t})
