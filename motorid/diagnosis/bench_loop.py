@@ -86,10 +86,8 @@ def identify_on(bench: str | Link, folder: str | Path = ".", *, goal: str = "dis
 
     Raises
     ------
-    UsageError
-        For words or limits that make no sense.
-    DeviceError
-        If the bench cannot be reached.
+    UsageError, DeviceError
+        For words or limits that make no sense; if the bench cannot be reached.
 
     Examples
     --------

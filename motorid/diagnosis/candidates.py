@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from dataclasses import replace
 from functools import reduce
-from itertools import product
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from motorid.diagnosis.model_comparison import COMMON, Node, beats, evidence, fa
 from motorid.diagnosis.predictive_score import QUICK, Evidence, HeldOut, deciding
 from motorid.diagnosis.refit import LITTLE, STOPPED, GivenUp, Task, completed, hidden_in, led_on, refit, refits, widened
 from motorid.diagnosis.results import Candidate
-from motorid.diagnosis.score_test import Score, beside_the_first, pairs_of, rank, with_phase_per_run, with_warm_start
+from motorid.diagnosis.score_test import Score, pairs_of, rank, with_phase_per_run, with_warm_start
 from motorid.diagnosis.thresholds import MATERIAL
 from motorid.display.numbers import listed
 from motorid.effects import LIBRARY, MEASURED, OTHER, PER_RUN, get
@@ -221,17 +221,16 @@ class Search:
         return tasks
 
     def _shortlist(self, node: Node) -> list[Score]:
-        """Return what is worth a refit: the best and what explains most beside it, what is common and near the best,
-        and what a score cannot show. Far from the records slopes say little, and all that is common is tried; what has
-        no free parameter has no slope; a line in the spectrum over the angle is no accident, however small beside the
-        rest of the misfit."""
+        """Return what is worth a refit: the best and what explains most beside it (what has nothing to do with a misfit
+        that several could explain ranks behind all of them), what is common and near the best, and what a score cannot
+        show. Far from the records slopes say little, and all that is common is tried; what has no free parameter has no
+        slope; a line in the spectrum over the angle is no accident, however small beside the rest of the misfit."""
         scores, astray, unmet = self.scores(node), lost(node.fit), bool(far(node.fit))
-        other = beside_the_first(deciding(node.fit), scores)
+        other = [b for _, b in pairs_of(deciding(node.fit), product(scores[:1], scores[1:]), 1)]
         near = NEAR * max((s.drop for s in scores), default=0.0)
         return [s for k, s in enumerate(scores)
                 if (s.drop > 0 and (k < SHORTLIST or s.stands_out or (s.effect.name in COMMON and s.drop > near)))
-                or s in other
-                or (s.effect.name in self._always and s.shapes) or (astray and s.effect.name in COMMON)
+                or s in other or (s.effect.name in self._always and s.shapes) or (astray and s.effect.name in COMMON)
                 or (unmet and not any(p.vary for p in s.effect.parameters))]
 
     def _takeable(self, model: Model) -> tuple[list[Effect], list[Effect]]:
@@ -260,7 +259,7 @@ class Search:
     def expand_by_two(self, node: Node) -> list[Node]:
         """Return the judged models larger by two effects that only together show: each alone was refused."""
         present, tasks = node.fit.model, []
-        for a, b in pairs_of(deciding(node.fit), self._shortlist(node), PAIRS):
+        for a, b in pairs_of(deciding(node.fit), combinations(self._shortlist(node), 2), PAIRS):
             with contextlib.suppress(ModelError):
                 best = {**a.starts[0], **b.starts[0]}  # and the next best of either
                 starts = [best, *({**best, **s.starts[1]} for s in (a, b) if len(s.starts) > 1)]

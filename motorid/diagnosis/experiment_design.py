@@ -72,10 +72,8 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
 
     Raises
     ------
-    UsageError
-        If fewer than two fits are given.
-    FitError
-        If no candidate can be simulated with all of them.
+    UsageError, FitError
+        If fewer than two fits are given, or no candidate can be simulated with all of them.
 
     Examples
     --------
@@ -260,10 +258,8 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
 
     Raises
     ------
-    UsageError
-        For words, names or limits that make no sense.
-    FitError
-        If no record within the limits can be found.
+    UsageError, FitError
+        For words, names or limits that make no sense; if no record within the limits can be found.
 
     Examples
     --------

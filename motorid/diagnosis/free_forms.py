@@ -300,8 +300,7 @@ def _along(form: Form, span: Span, low: float, high: float) -> list[str]:
     if form.on != "theta":  # what warms up, or runs in
         whole = high - low
         sudden += [f"ca.exp(-z / {_place(whole / k, whole / 300, whole * 10)})" for k in FADES]
-    most = 2 * KNOTS if form.on == "theta" else KNOTS
-    return ["1.0", *(f"ca.cos({k} * {scale})" for k in range(1, most)), *sudden]
+    return ["1.0", *(f"ca.cos({k} * {scale})" for k in range(1, (1 + (form.on == "theta")) * KNOTS)), *sudden]
 
 
 def _of_size(form: Form, span: Span, low: float, high: float) -> list[str]:

@@ -288,8 +288,7 @@ def predictions_left_out(fit: Fit, evenly: bool = False) -> Channels | None:
     moved = otherwise(np.array([np.inf]), np.linalg.LinAlgError, lambda: left_out(residual, columns, labels))
     if not np.isfinite(moved).all() or moved @ moved > thresholds.UNRELIABLE**2 * (residual @ residual):
         return None
-    found = by_channel(problem, moved, blocks)
-    return {c: replace(e, fine=finer(fit, c)) for c, e in found.items()}
+    return {c: replace(e, fine=finer(fit, c)) for c, e in by_channel(problem, moved, blocks).items()}
 
 
 def stacked_labels(problem: Problem, blocks: Sequence[NDArray[np.intp]]) -> NDArray[np.intp]:

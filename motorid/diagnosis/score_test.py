@@ -9,7 +9,6 @@ that cannot be differentiated at their null are simulated at a few finite shapes
 from __future__ import annotations
 
 import contextlib
-import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -76,27 +75,16 @@ def rank(fit: Fit, effects: Sequence[Effect], known: Sequence[Score] = ()) -> li
     return sorted(scores, key=lambda s: -s.drop)
 
 
-def pairs_of(fit: Fit, scores: Sequence[Score], most: int) -> list[tuple[Score, Score]]:
+def pairs_of(fit: Fit, pairs: Iterable[tuple[Score, Score]], most: int) -> list[tuple[Score, Score]]:
     """Return the pairs of effects that together explain most, more than either alone, best first."""
-    return _explaining_most(Tangent.of(fit), itertools.combinations(scores, 2))[:most]
-
-
-def beside_the_first(fit: Fit, scores: Sequence[Score]) -> list[Score]:
-    """Return the effect that with the first explains most, if that is more than either alone: what has nothing to do
-    with a misfit that several could explain is ranked behind all of them."""
-    return [b for _, b in _explaining_most(Tangent.of(fit), itertools.product(scores[:1], scores[1:]))[:1]]
-
-
-def _explaining_most(tangent: Tangent, pairs: Iterable[tuple[Score, Score]]) -> list[tuple[Score, Score]]:
-    """Return the pairs of effects that together explain more than either alone, best first."""
-    found = []
+    tangent, found = Tangent.of(fit), []
     for a, b in pairs:
         if a.shapes and b.shapes and not (a.same_as or b.same_as):
             columns = np.hstack([a.shapes[0].columns, b.shapes[0].columns])
             drop = tangent.explained(columns, [*a.shapes[0].nonnegative, *b.shapes[0].nonnegative]).share
             if drop > (1 + MORE) * max(a.drop, b.drop):
                 found.append((drop, a, b))
-    return [(a, b) for _, a, b in sorted(found, key=lambda pair: -pair[0])]
+    return [(a, b) for _, a, b in sorted(found, key=lambda pair: -pair[0])[:most]]
 
 
 def with_phase_per_run(fit: Fit, scores: Sequence[Score], zero: Effect) -> list[Score]:

@@ -430,9 +430,8 @@ def _in_windows(found: Climb) -> Fit | None:
 
     A pendulum upright says so only with its weight in the model; detents may be refused as the motor rested in others.
     Where the last model loses a channel, an axis drifts: no force is known so well that its sum is the motion. So it
-    may where a spring draws back what the first one loses: in a position loop that helps, whatever is missing; but
-    what leaves noise alone on whole records is no matter of chance.
-    """
+    may where a spring draws back what the first one loses: in a position loop that helps, whatever is missing. What
+    leaves noise alone on whole records is no matter of chance."""
     if at_noise(found.path[-1]):
         return None
     first, last = found.path[0].fit, found.path[-1].fit

@@ -38,8 +38,7 @@ def speed_delay(m: Equations,
                 T_d=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0), doc="delay of the speed measurement")):
     """Delay of the speed measurement, Padé of orders 4 and 5. Golub & Van Loan, 2013, sec. 9.3."""
     # With fewer zeros than poles a jump does not pass at once; x = Ts, (15120 − 6720x + …)/(15120 + 8400x + …).
-    b = tuple(k / 15120 for k in (-6720, 1260, -120, 5))
-    _filter(m, "omega", "delayed", T_d, (15120, 8400, 2100, 300, 25), b)
+    _filter(m, "omega", "delayed", T_d, (15120, 8400, 2100, 300, 25), tuple(k / 15120 for k in (-6720, 1260, -120, 5)))
 
 
 @effect(balance="sensor")

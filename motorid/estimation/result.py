@@ -289,11 +289,9 @@ class Fit(Shown):
 
         Raises
         ------
-        UsageError
-            If the file must not be written there, or the fit holds code of your own: a `Constraint`, an engine, or
-            multiple shooting with process noise.
-        OutputError
-            If the disk refuses.
+        UsageError, OutputError
+            If the file must not or cannot be written there, or the fit holds code of your own: a `Constraint`, an
+            engine, or multiple shooting with process noise.
         """
         if self.formulation == "process noise":
             raise UsageError("a fit with process noise cannot be saved; its model can, mi.export(fit, 'motor.json').")

@@ -66,7 +66,7 @@ class Exported:
 
 def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str | None = None, *,
            force: bool = False) -> Path:
-    """Write a fitted model in a form that works without motorid.
+    """Write a fitted model in a form that works without motorid; return the file (of several, the main one).
 
     Parameters
     ----------
@@ -80,17 +80,10 @@ def export(found: Fit | Model | Exported, path: str | os.PathLike[str], to: str 
     force : bool
         Also over files that motorid did not write.
 
-    Returns
-    -------
-    Path
-        The file written (of several, the main one).
-
     Raises
     ------
-    UsageError
-        If the form is not known, or a file must not be written there.
-    OutputError
-        If the disk refuses.
+    UsageError, OutputError
+        If the form is not known, or a file must not or cannot be written there.
 
     Examples
     --------
@@ -137,10 +130,8 @@ def load(path: str | os.PathLike[str], effects: Iterable[Effect] = (), *,
 
     Raises
     ------
-    DataError
-        If the file cannot be read, or is none of these.
-    ModelError
-        If an effect is not known; the message says what is needed.
+    DataError, ModelError
+        If the file cannot be read, is none of these, or has an effect that is not known: the message says what to give.
 
     Examples
     --------

@@ -118,17 +118,6 @@ BALANCES = ("voltage", "torque", "transmission", "sensor")
 class Effect(Shown):
     """One physical effect: a law that writes on the `Equations` sheet.
 
-    Attributes
-    ----------
-    law : callable
-        ``law(m, **symbols)``.
-    balance : str
-        ``"voltage"``, ``"torque"``, ``"transmission"`` or ``"sensor"``.
-    doc : str
-        What it is, with its source.
-    includes : tuple of str
-        Effects that this one contains as a special case (Stribeck friction contains Coulomb's).
-
     Examples
     --------
     >>> mi.effects.cogging
@@ -137,11 +126,11 @@ class Effect(Shown):
     """
 
     name: str
-    law: Callable[..., None] | None
+    law: Callable[..., None] | None  # law(m, **symbols)
     parameters: tuple[Parameter, ...]
-    balance: str
-    doc: str = ""
-    includes: tuple[str, ...] = ()
+    balance: str  # one of `BALANCES`
+    doc: str = ""  # what it is, with its source
+    includes: tuple[str, ...] = ()  # effects that this one contains as a special case (Stribeck friction Coulomb's)
 
     @property
     def title(self) -> str:

@@ -37,27 +37,6 @@ UNTOUCHED = {"width": ("integrator", "measured"), "engine": ("outputs", "system"
 class Problem:
     """A model, the records it should explain, and what else is asked.
 
-    Attributes
-    ----------
-    priors : mapping of str to (mean, std)
-        What is known of a parameter beforehand, in its unit.
-    penalties, constraints : tuple
-        See `motorid.problem.constraints`; penalties enter the residual, constraints are for `MultipleShooting`.
-    loss : Huber or None
-        None: least squares.
-    weights : {"noise", "rms"}
-        Residuals divided by the channel's noise, or by the RMS of the measured channel (the source paper's).
-    initial : {"auto", "rest", "measured", "estimate"}
-        What is known of the state at the first sample.
-    noise_factors : mapping of str to float
-        Factors on the noise per channel where the misfit, not the noise, decides (reweighting).
-    accuracy : float, optional
-        Local error of the integration relative to the largest state; by default a small part of the noise.
-    width : float, optional
-        Width of sgn, rad/s, in place of the model's or the one that suits the records (continuation).
-    first_stands : bool
-        The first run has no parameters of its own, whatever else is free (where one is fixed for its profile).
-
     Examples
     --------
     >>> problem = mi.Problem(mi.dc_motor(), runs, priors={"R": (1.3, 0.1)})
@@ -66,17 +45,17 @@ class Problem:
 
     model: Model
     experiments: tuple[Experiment, ...]
-    priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    penalties: tuple[Any, ...] = ()
-    constraints: tuple[Any, ...] = ()
-    loss: Huber | None = None
-    weights: str = "noise"
-    initial: str = "auto"
+    priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # (mean, std) of a parameter, in its unit
+    penalties: tuple[Any, ...] = ()  # see `motorid.problem.constraints`: these enter the residual, and
+    constraints: tuple[Any, ...] = ()  # these are for `MultipleShooting`
+    loss: Huber | None = None  # least squares
+    weights: str = "noise"  # of each channel, or "rms": that of the measured channel (the source paper's)
+    initial: str = "auto"  # or "rest", "measured", "estimate": what is known of the state at the first sample
     engine: str | Engine = "rosenbrock"
-    noise_factors: Mapping[str, float] = field(default_factory=dict)
-    accuracy: float | None = None
-    width: float | None = None
-    first_stands: bool = False
+    noise_factors: Mapping[str, float] = field(default_factory=dict)  # where the misfit, not the noise, decides
+    accuracy: float | None = None  # local error over the largest state; by default a small part of the noise
+    width: float | None = None  # of sgn, rad/s, in place of the one that suits the records (continuation)
+    first_stands: bool = False  # the first run has no parameters of its own (where one is fixed for its profile)
     _runs: tuple[Run, ...] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -262,8 +241,7 @@ class Problem:
 
     def worth(self, residual: Array) -> float:
         """Return how many independent samples a residual (n, …) is worth, priors and penalties left aside."""
-        parts = self.unstack(residual[: self.n_outputs])
-        return sum(effective_samples(column) for part in parts for column in part.T)
+        return sum(effective_samples(column) for part in self.unstack(residual[: self.n_outputs]) for column in part.T)
 
     def residual(self, q: Array) -> Array:
         """Return the whitened residual: outputs run by run, then priors, then penalties; or raise `SimulationError`."""

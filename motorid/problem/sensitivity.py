@@ -76,10 +76,8 @@ def check_derivatives(problem: Problem, q: Array | None = None, *, steps: Sequen
 
     Raises
     ------
-    UsageError
-        If there is nothing to differentiate, or `q` has the wrong length.
-    SimulationError
-        If the model cannot be simulated at `q` or beside it.
+    UsageError, SimulationError
+        If there is nothing to differentiate, `q` has the wrong length, or the model cannot be simulated there.
 
     Examples
     --------

@@ -275,11 +275,6 @@ def evaluate(fit_or_model: Any, runs: Sequence[Experiment] | Experiment, **optio
     **options
         `engine` and `initial` as in `simulate`.
 
-    Raises
-    ------
-    UsageError
-        If the first is neither a fit nor a model.
-
     Examples
     --------
     >>> mi.evaluate(better, check)

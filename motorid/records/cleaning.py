@@ -51,15 +51,7 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
         if "theta" in outputs and places["theta"].unit.symbol == "rad":
             measured = {c: y[part] for c, y in outputs.items()}
             outputs["theta"][part] = _going_on(measured, t[part], places["theta"].column, said)
-    for c, y in outputs.items():
-        if (again := repeats(y)).any():
-            outputs[c] = np.where(again, np.nan, y)
-            said.append(f"'{places[c].column}' ({c}) was read more often than it was measured: of {len(y)} samples "
-                        f"{np.count_nonzero(again)} repeat the one before and do not count.")
-        elif (fresh := fresh_means(t, y, inputs["v"])) is not y:
-            outputs[c] = fresh
-            said.append(f"'{places[c].column}' ({c}) was read more often than it was measured, behind noise: of "
-                        f"{len(y)} samples {np.count_nonzero(np.isfinite(fresh))} means of what repeats count.")
+    outputs = {c: _measured_once(t, y, inputs["v"], f"'{places[c].column}' ({c})", said) for c, y in outputs.items()}
     extra = {c: a[rows] for c, a in columns.items() if c not in used}
     if set(texts) - used:
         said.append(f"left out columns of text: {', '.join(sorted(set(texts) - used))}.")
@@ -74,6 +66,18 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
         return Experiment(t, inputs, outputs, sigma, cast(Any, hold), units, name, facts)
     except DataError as error:
         raise DataError(str(error).removeprefix(f"{name}: ")) from None
+
+
+def _measured_once(t: Array, y: Array, v: Array, what: str, said: list[str]) -> Array:
+    """Return an output without samples that only repeat the one before, as they are or behind noise."""
+    if (again := repeats(y)).any():
+        said.append(f"{what} was read more often than it was measured: of {len(y)} samples {np.count_nonzero(again)} "
+                    "repeat the one before and do not count.")
+        return np.where(again, np.nan, y)
+    if (fresh := fresh_means(t, y, v)) is not y:
+        said.append(f"{what} was read more often than it was measured, behind noise: of {len(y)} samples "
+                    f"{np.count_nonzero(np.isfinite(fresh))} means of what repeats count.")
+    return fresh
 
 
 def _without_marks(columns: Mapping[str, Array], measured: Iterable[str], said: list[str]) -> dict[str, Array]:

@@ -28,7 +28,7 @@ LEFT_OUT = "{} is left out, because it could not be made: {}"
 
 def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
            validate: Sequence[Any] | Experiment = (), force: bool = False) -> Path:
-    """Write the story of a result as one HTML page: no network, no script, figures inside.
+    """Write the story of a result as one HTML page, no network, no script, figures inside; return its path.
 
     The answer first, with its figure, the errors before and after and the next step; then parameters, fits, held-out
     records, where the model fails, the effects tried, the data and their checks, and the provenance. A fit
@@ -47,17 +47,10 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
     force : bool
         Also over a file that motorid did not write.
 
-    Returns
-    -------
-    Path
-        The file written.
-
     Raises
     ------
-    UsageError
+    UsageError, OutputError
         If there is nothing to tell, or the file must not or cannot be written there.
-    OutputError
-        If the disk refuses.
 
     Examples
     --------

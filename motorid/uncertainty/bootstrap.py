@@ -122,10 +122,8 @@ def bootstrap(fit: Fit, *, kind: str = "blocks", n: int = 200, block: int | None
 
     Raises
     ------
-    UsageError
-        If there are too few runs to resample them, or the kind is unknown.
-    FitError
-        If fewer than two refits worked.
+    UsageError, FitError
+        If there are too few runs to resample them, or the kind is unknown; if fewer than two refits worked.
 
     Examples
     --------

@@ -109,11 +109,6 @@ def covariance(fit: Fit, *, method: str = "coloured") -> Covariance:
     method : {"coloured", "white"}
         ``"white"``: M without correlation between samples.
 
-    Raises
-    ------
-    UsageError
-        If the method is unknown.
-
     Examples
     --------
     >>> sure = mi.covariance(better)

@@ -90,10 +90,9 @@ class MultipleShooting:
 
         Raises
         ------
-        UsageError
-            A constraint does not go with the model.
-        FitError
-            The constraints that it names contradict one another or the records, or the start cannot be simulated.
+        UsageError, FitError
+            A constraint does not go with the model; those that it names contradict one another or the records, or the
+            start cannot be simulated.
         """
         began = time.perf_counter()
         for c in (*problem.constraints, *problem.penalties):
