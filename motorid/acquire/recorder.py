@@ -64,10 +64,8 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
 
     Raises
     ------
-    UsageError, DataError
-        Words, limits, files or calibration are wrong; nothing has moved.
-    DeviceError
-        The port cannot be opened, nobody answers, or the device refuses.
+    UsageError, DataError, DeviceError
+        Words, limits, files or calibration are wrong, the port cannot be opened, nobody answers, or the device refuses.
 
     Examples
     --------

@@ -310,11 +310,9 @@ def _half_a_sample(fit: Fit, effect: Effect) -> bool:
     if abs(late - half) < max(TRIFLE * half, min(unsure, half)):
         return True
     if "i" in fit.problem.outputs or late > AS_LATE * half:
-        return False
-    with contextlib.suppress(*FAILURES):  # without a current the winding's own lag may make up for the rest
-        held = solve(fit.problem.with_(model=fit.model.fix(**{name: half / share})), QUICK, start="model")
-        return held.cost < fit.cost + NATS
-    return False
+        return False  # without a current the winding's own lag may make up for the rest
+    held = fit.problem.with_(model=fit.model.fix(**{name: half / share}))
+    return otherwise(False, FAILURES, lambda: solve(held, QUICK, start="model").cost < fit.cost + NATS)
 
 
 def _within_smoothing(fit: Fit, effect: Effect) -> str:

@@ -200,13 +200,12 @@ def _sure_to_the_end(found: Climb) -> Climb:
     """Return a climb in which stops that the motor runs through are named no more; nor, where more than noise is left,
     a law that the records do not show whole: a free parameter makes it fit what has another shape. Nor, beside what
     only approximates, one of which they show nothing: that is as likely to stand in for something else."""
-    fit, grades = found.path[-1].fit, found.grades
-    more = not found.remaining.adequate or bool(far(fit))
-    half = any(g.grade == "approximates" and g.why != misspecification.DIFFERENCED for g in grades)
+    more = bool(far(fit := found.path[-1].fit)) or not found.remaining.adequate
+    half = any(g.grade == "approximates" and g.why != misspecification.DIFFERENCED for g in found.grades)
     told = {e.name: run_through(fit, e) or (undetermined(fit, e, not more) if more or half else "")
             for e in fit.model.effects}
     return replace(found, grades=tuple(g if g.grade == "approximates" or not told[g.effect] else Grade(
-        g.effect, "approximates", told[g.effect]) for g in grades))
+        g.effect, "approximates", told[g.effect]) for g in found.grades))
 
 
 def _sure_alone(search: Search, best: Node, grades: tuple[Grade, ...]) -> tuple[Grade, ...]:

@@ -84,10 +84,8 @@ def fit(model: Model, runs: Sequence[Experiment] | Experiment, *, solver: Any = 
 
     Raises
     ------
-    UsageError, ModelError, DataError
-        The words or the data were wrong.
-    FitError
-        The model cannot be simulated at any starting point.
+    UsageError, ModelError, DataError, FitError
+        The words or the data were wrong, or the model cannot be simulated at any starting point.
 
     Notes
     -----

@@ -24,32 +24,23 @@ class Parameter:
 
     Attributes
     ----------
-    value : float
-        Present value, in `unit`.
-    unit : str
-        SI unit, e.g. ``"N·m"``; it also tells the natural size of the parameter in a record.
-    lower, upper : float
-        Physical limits, enforced by the solvers.
-    positive : bool
-        Lives on a logarithmic scale (R, L, K, b, J, time constants).
-    vary : bool
-        False: fixed at `value` in a fit.
-    null : float or None
-        Value at which the effect vanishes; None for shape parameters (a Stribeck speed, an angle).
-    grid : tuple of float
-        For shape parameters: where to start, in natural sizes of `unit` in the data (dimensionless: absolute).
-    periodic : bool
-        A phase angle: starts are found from its sine and cosine part together.
-    order : bool
-        A number of periods per turn, found from the spectrum of the misfit over the angle.
+    value, unit : float, str
+        Present value, in an SI unit, e.g. ``"N·m"``, which also tells the natural size of the parameter in a record.
+    lower, upper, positive : float, float, bool
+        Physical limits, enforced by the solvers; on a logarithmic scale (R, L, K, b, J, time constants).
+    vary, given : bool
+        Estimated, not fixed at `value`; set by the user, so that no first guess replaces it.
+    null, grid : float or None, tuple of float
+        Value at which the effect vanishes; None for shape parameters (a Stribeck speed, an angle), which start from
+        `grid`, in natural sizes of `unit` in the data (dimensionless: absolute).
+    periodic, order : bool
+        A phase angle, whose starts are found from its sine and cosine part together; a number of periods per turn,
+        found from the spectrum of the misfit over the angle.
     per_run : bool
         Another in every run (an encoder's zero): `value` is that of the first run, the others are estimated apart.
-    place : bool
-        A place on the way of the angle: its `grid` is in shares of the travel, 0 the lowest and 1 the highest angle.
-    pole : bool
-        A lag in series with the winding's own, L/R, for which a fit may take it: it starts from both places.
-    given : bool
-        Set by the user; then no first guess replaces it.
+    place, pole : bool
+        A place on the way of the angle, its `grid` in shares of the travel, 0 the lowest and 1 the highest angle; a lag
+        in series with the winding's own, L/R, for which a fit may take it: it starts from both places.
     at_least : str
         Name of the parameter that this one cannot fall below (breakaway friction, Coulomb's); `diagnose` checks it.
 

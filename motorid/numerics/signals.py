@@ -126,8 +126,7 @@ def fresh_means(t: Array, y: Array, v: Array) -> Array:
     for every in range(MOST_HELD, 2, -1):  # a divisor of the true number would do as well
         change = _means(squares[: len(squares) // every * every].reshape(-1, every).T)
         at = int(change.argmax())
-        between = float(np.delete(change, at).max())
-        if 0 < HELD * between < change[at]:
+        if 0 < HELD * (between := float(np.delete(change, at).max())) < change[at]:
             held = whole[at + 1: at + 1 + (len(whole) - at - 1) // every * every].reshape(-1, every)
             if _means((held[:, -1:] - held[:, :1]).T ** 2)[0] < 1.5 * between:  # over a hold white noise has no more
                 fresh = np.full(len(whole), np.nan)

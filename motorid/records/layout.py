@@ -54,6 +54,9 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     _named_by_header(places, free, row, notes, [c for c, column in (columns or {}).items() if column is None])
     _last_resorts(places, row, values or {}, notes, {*(columns or {}), *units})
     _apply_units(places, labels, units, notes)
+    if (v := places.get("v")) and v.unit.offset:
+        notes.append(f"'{v.column}' is read as a servo's pulses: {-v.unit.offset / v.unit.factor:g} {v.unit.label[:2]} "
+                     "is 0, 500 µs more is 1 (say where it rests: units={'v': 'us:1500'}).")
     # An angle in counts of unknown size is left out, unless it is all there is.
     for channel in (unscaled := [c for c in ("theta", "omega") if c in places and math.isnan(places[c].unit.factor)]):
         if {"i", "omega", "theta"} & set(places) == {channel}:
@@ -102,6 +105,8 @@ def _named_by_user(labels: Sequence[str], columns: Mapping[str, object], units: 
             continue
         label = _find(labels, column)
         unit = row[label] or headers.unit_in(label)[1]
+        if unit and channel == "v" and unit.dimension == "time":  # a servo's pulse
+            unit = headers.require_unit(unit.label, channel)
         if unit and unit.dimension not in DIMENSIONS[channel]:
             named = headers.classify(label, row[label])  # u_a is in no ampere, current_A is
             if not {channel, label} & set(units) and ((named and named.unit) or headers.unit_in(label)[2]):

@@ -50,7 +50,7 @@ def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] |
         Channel (t, v, i, omega, theta, v_supply, tau_load, temp) to column, by name or by position counted from 1,
         where the header does not tell: ``{"v": "u_volt"}``; to None where it is to be left out.
     units : mapping, optional
-        Channel or column to unit: ``{"omega": "rpm", "theta": "counts:2048", "i": "-1 A"}``.
+        Channel or column to unit: ``{"omega": "rpm", "theta": "counts:2048", "i": "-1 A", "v": "us:1500"}``.
     hold : {"zoh", "linear"}, optional
         The input between samples; by default what the file says (see `write_csv`), else "zoh".
     dt : float, optional

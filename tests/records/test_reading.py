@@ -450,6 +450,24 @@ def test_what_a_drive_holds_is_measured_once_behind_noise_too(tmp_path, rng):
         assert np.isfinite(read_runs(_written(table, tmp_path))[0].outputs["omega"]).all()
 
 
+def test_the_pulses_of_a_servo_are_a_command(tmp_path):
+    """A bench's "Servo 3 (µs)" was refused: a time, expected a voltage."""
+    table = pd.DataFrame({"t": np.arange(20) / 50, "Servo 3 (µs)": np.linspace(1000, 1750, 20), "rpm": np.arange(20.0)})
+    path = _written(table, tmp_path)
+    run = read_csv(path, columns={"v": "Servo 3 (µs)"})
+    assert run.inputs["v"][[0, -1]] == pytest.approx([-1.0, 0.5])
+    assert run.units["v"] == "1"
+    assert "servo's pulses: 1500 µs is 0, 500 µs more is 1" in notes(run)
+    for unit in ("us:1000", "µs:1000"):
+        assert read_csv(path, columns={"v": 2}, units={"v": unit}).inputs["v"][[0, -1]] == pytest.approx([0.0, 1.5])
+    table["Servo 3 (µs)"] /= 1000
+    wide = read_csv(_written(table, tmp_path), columns={"v": 2}, units={"v": "ms"})
+    assert wide.inputs["v"] == pytest.approx(run.inputs["v"])
+    for unit in ("h", "us:x"):
+        with pytest.raises(DataError, match=r"cannot be in|unknown unit"):
+            read_csv(path, columns={"v": 2}, units={"v": unit})
+
+
 def _written(table, folder):
     path = folder / "run.csv"
     table.to_csv(path, index=False)
