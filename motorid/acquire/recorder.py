@@ -65,7 +65,7 @@ def record(port: str | Link, out: str | Path, *, baud: int = 115_200, excite: st
     Raises
     ------
     UsageError, DataError, DeviceError
-        Words, limits, files or calibration are wrong, the port cannot be opened, nobody answers, or the device refuses.
+        Words, limits, files or calibration are wrong (nothing has moved); no port, no answer, or the device refuses.
 
     Examples
     --------

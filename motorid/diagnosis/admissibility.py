@@ -83,11 +83,11 @@ def certain(fit: Fit) -> dict[str, float | None]:
 def undetermined(fit: Fit, effect: Effect, wholly: bool = False) -> str:
     """Say which parameters of an effect the records leave open, as voltages too, `wholly` only if those are all that it
     has; empty for none."""
-    own = [p.name for p in effect.parameters if fit.problem.model.parameters[p.name].vary]
-    std = certain(fit) if wholly else fit.std
-    found = [n for n in own if n not in fit.per_run and std[n] is None and f"{n}_voltage" not in fit.determined]
-    said = f"{listed(found)} {'are' if found[1:] else 'is'} not determined"
-    return "" if not found or (wholly and found != own) else said if wholly else f"{said}, and the rest is not noise"
+    own = [p for p in effect.parameters if fit.problem.model.parameters[p.name].vary]
+    known = {n for n, s in (certain(fit) if wholly else fit.std).items() if s is not None}
+    found = [p.name for p in own if not p.per_run and not {p.name, f"{p.name}_voltage"} & {*known, *fit.determined}]
+    least, left = (max(len(own), 1), "") if wholly else (1, ", and the rest is not noise")
+    return f"{listed(found)} {'are' if found[1:] else 'is'} not determined{left}" if len(found) >= least else ""
 
 
 def _blurred(fit: Fit, added: Effect) -> str:
