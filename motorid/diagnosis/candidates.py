@@ -366,6 +366,15 @@ class Search:
                 node = self.nodes[node.key] = replace(node, fit=fit, predictions=self.held.predictions(fit))
         return self._fitted(node, node.fit.model) if node.fit.status != "converged" and far(node.fit) else node
 
+    def led_out(self, node: Node, larger: Node) -> Node:
+        """Return a model fitted on from where a larger one ended, if that predicts better: its own descent had stopped
+        in a valley, and what the larger one has more only led it out."""
+        fit = None if node is self.root else led_on(node.fit, larger.fit)
+        if fit is not None and beats(onward := replace(node, fit=fit, predictions=self.held.predictions(fit)), node):
+            self._scores.pop(node.key, None)
+            self.nodes[node.key] = node = onward
+        return node
+
     def _fitted(self, node: Node, model: Model, start: str = "model") -> Node:
         """Return a model fitted as a whole, where that predicts better."""
         with contextlib.suppress(*FAILURES):

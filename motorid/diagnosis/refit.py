@@ -16,7 +16,7 @@ from motorid.errors import OutOfTime, otherwise
 from motorid.estimation.continuation import by_continuation, past_ripples, sharpened
 from motorid.estimation.first_guess import first_guess
 from motorid.estimation.fit import LOST, lost
-from motorid.estimation.least_squares import FAILURES, Estimate
+from motorid.estimation.least_squares import FAILURES, Estimate, cost_at
 from motorid.estimation.linearisation import Tangent
 from motorid.estimation.restarts import collapsed_again, restored
 from motorid.estimation.result import Fit
@@ -209,12 +209,17 @@ def _polished(fit: Fit, problem: Problem, effort: LevenbergMarquardt) -> Fit | N
     return None
 
 
-def led_on(fit: Fit) -> Fit | None:
-    """Return a refit led on to its optimum, along the model's own angle where that no longer drifts; None for none."""
-    descent = partial(by_continuation, effort=OPTIMUM, wide=False)
+def led_on(fit: Fit, larger: Fit | None = None) -> Fit | None:
+    """Return a refit led on to its optimum, along the model's own angle where that no longer drifts; from where that of
+    a `larger` model ended, if it costs less there. None for none."""
+    descent, problem, q = partial(by_continuation, effort=OPTIMUM, wide=False), fit.problem, fit.q
+    if larger is not None:
+        there = {**larger.initial, **larger.values}
+        q = problem.scaling.scaled([there.get(p.name, p.value) for p in problem.unknown])
     with contextlib.suppress(*FAILURES):
-        done = _on_its_own(along := descent(fit.problem.begun_at(fit.q)), descent)
-        return _fit_of(done) if done is not along or done.cost < fit.cost else None
+        if larger is None or cost_at(problem, q) < fit.cost - NATS:
+            done = _on_its_own(along := descent(problem.begun_at(q)), descent)
+            return _fit_of(done) if done is not along or done.cost < fit.cost else None
     return None
 
 

@@ -127,6 +127,10 @@ def _rounds(found: Climb, max_effects: int) -> Iterator[Climb]:
         else:
             yield replace(found, text="stopped: no further effect lowers the error on data left out")
             return
+        if (out := search.led_out(best, new)) is not best:
+            best, found = out, _with(replace(found, rounds=found.rounds[:-1]), out, out, False, ())
+            found = replace(found, remaining=judge_adequacy(out, search.scores(out)))
+            continue
         pruned = search.exchanged(search.pruned(new, best), best)
         pruned = pruned if pruned is new else search.brought_to_its_end(pruned)
         chosen_of = pruned if pruned.added != new.added and pruned.parent is new.parent else new

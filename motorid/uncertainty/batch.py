@@ -133,7 +133,8 @@ def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path
     ----------
     model : Model
     motors : mapping of str to records
-        Per motor its runs, or where they are: a path, a pattern, several of these; read by the worker.
+        Per motor its runs, or where they are: a path, a pattern, several of these; read by the worker. UsageError for
+        none.
     journal : path, optional
         Results go to this file as they come; what it holds for the same model, options and records is not done again.
     map : callable, optional
@@ -144,11 +145,6 @@ def fit_many(model: Model, motors: Mapping[str, Records], *, journal: str | Path
         No progress bar.
     **options
         As in `fit`.
-
-    Raises
-    ------
-    UsageError
-        If there are no motors.
 
     Examples
     --------
@@ -206,12 +202,8 @@ def _row(found: Fit) -> dict[str, Any]:
 
 
 def motors_in(folder: str | Path) -> dict[str, list[Path]]:
-    """Return the records in a folder by motor: every subfolder is one, and so is every file beside them.
-
-    Raises
-    ------
-    DataError
-        If the folder does not exist or holds no records.
+    """Return the records in a folder by motor: every subfolder is one, and so is every file beside them; DataError for
+    a folder that does not exist or holds none.
 
     Examples
     --------

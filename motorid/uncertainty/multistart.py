@@ -36,11 +36,11 @@ def multistart(problem_or_fit: Problem | Fit, *, starts: int = 100, spread: floa
     Parameters
     ----------
     problem_or_fit : Problem or Fit
-        The reference; a problem is solved first.
+        The reference; a problem is solved first. UsageError for anything else.
     starts : int
     spread : float
-        Starts are log-uniform within this factor on either side of the reference, in every free parameter; a parameter
-        that may be negative is moved by the same factors, and its sign is kept; a phase is drawn from the whole circle.
+        Starts are log-uniform within this factor, at least 1, on either side of the reference, in every free parameter;
+        one that may be negative is moved by the same factors, its sign kept; a phase is drawn from the whole circle.
     seed : int
         The starts depend on it alone, not on the pool.
     guess : bool
@@ -51,11 +51,6 @@ def multistart(problem_or_fit: Problem | Fit, *, starts: int = 100, spread: floa
         Anything with the signature of `map`; see `motorid.numerics.parallel`.
     quiet : bool
         No progress bar.
-
-    Raises
-    ------
-    UsageError
-        If there is nothing to start from, or the spread is below 1.
 
     Examples
     --------

@@ -103,15 +103,10 @@ def profile(fit: Fit, name: str, *, level: float = 0.95, map: Map | None = None,
     ----------
     fit : Fit
     name : str
-        A free parameter.
+        A free parameter; UsageError for any other.
     level : float
     map, quiet
         As in `multistart`; the two sides are two tasks.
-
-    Raises
-    ------
-    UsageError
-        If the parameter is unknown or fixed.
 
     Examples
     --------

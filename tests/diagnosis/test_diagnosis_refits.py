@@ -28,7 +28,7 @@ from motorid.effects import LIBRARY
 from motorid.errors import OutOfTime
 from motorid.estimation.continuation import by_continuation
 from motorid.estimation.fit import solve
-from motorid.estimation.least_squares import Estimate
+from motorid.estimation.least_squares import Estimate, least_squares
 from motorid.estimation.restarts import MATTERS, collapsed_again, restored
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.numerics.parallel import budget, one_thread
@@ -266,6 +266,24 @@ def test_what_leaves_noise_on_whole_records_is_not_looked_at_in_windows(monkeypa
         path = [node_of(root, kept), node_of(last, kept)]
         assert stepwise._in_windows(SimpleNamespace(path=path, rounds=())) is None
         assert stepwise.in_windows.called is looked
+
+
+def test_where_a_larger_model_only_led_out_of_a_valley_the_smaller_one_goes_on():
+    """End stops whose descent had stopped at eight times the noise took a "cogging" of a thousandth of the torque."""
+    model = mi.dc_motor(**TRUE) + mi.effects.coulomb(tau_c=4e-3)
+    run = _run(model)
+    whole, larger = mi.fit(model, run), mi.fit(model + mi.effects.quadratic_drag, run)
+    problem = whole.problem.start_at({"K": 0.02, "tau_c": 1e-4, "J": 1e-5})
+    stuck = trial._fit_of(least_squares(problem, LevenbergMarquardt(max_iterations=1, looks=0)))
+    assert stuck.cost > 2 * whole.cost
+    kept = held.HeldOut.of(root := mi.fit(mi.dc_motor(), run), run)
+    tried = search.Search(root, run, search.library(["coulomb", "quadratic_drag"]), search.Stages())
+    small, large, right = (node_of(fit, kept, parent=tried.root) for fit in (stuck, larger, whole))
+    onward = tried.led_out(small, large)
+    assert onward.fit.cost < 1.001 * whole.cost
+    assert tried.nodes[small.key] is onward
+    assert tried.led_out(right, large) is right
+    assert tried.led_out(tried.root, small) is tried.root  # the fit that the user gave
 
 
 def test_what_a_sensor_invents_is_told_by_the_whole_record_also_in_its_parts(rng):
