@@ -76,7 +76,7 @@ def _measured_once(t: Array, y: Array, v: Array, what: str, said: list[str]) -> 
         return np.where(again, np.nan, y)
     if (fresh := fresh_means(t, y, v)) is not y:
         said.append(f"{what} was read more often than it was measured, behind noise: of {len(y)} samples "
-                    f"{np.count_nonzero(np.isfinite(fresh))} means of what repeats count.")
+                    f"{np.count_nonzero(np.isfinite(fresh))} count, each the mean of those that repeat it.")
     return fresh
 
 

@@ -192,7 +192,7 @@ def test_what_comes_in_the_place_of_two_leaves_room_for_another(monkeypatch):
     stages = SimpleNamespace(round=lambda k: None, done=lambda words: None)
     search = SimpleNamespace(root=node(), stages=stages, effects=(), nodes={}, brought_to_its_end=lambda new: new,
                              expand=lambda best: ([node(next(keys))], []), stopped="",
-                             pruned=lambda new, best: new, scores=lambda new: [],
+                             pruned=lambda new, best: new, scores=lambda new: [], led_out=lambda best, new: best,
                              exchanged=lambda new, best: new)
     for name, instead in {"at_noise": lambda best: False, "far": lambda fit: [],
                           "_better": lambda some, best: (next(iter(some)), list(some)), "group_of": lambda *_: (),
