@@ -27,6 +27,7 @@ WIDEST = 4e6  # numbers in the answers to all orders that are looked at together
 HIGHEST = 240
 PERIODS = 3  # within the travel
 SLOW_PART = 0.2  # of the motion that must be slow enough to show an order
+LESS_THAN_A_PERIOD = 1.8 * np.pi  # per sample
 QUARTER = np.pi / 2  # of a period per sample: slow enough to be sure
 SURE_PART = 0.02  # of the motion that must be slower than that, or faster parts are used too
 SAMPLES = 50  # and so many samples
@@ -70,12 +71,12 @@ def highest_order(tangent: Tangent) -> int:
     """Highest order that the samples can show: less than a period per sample for a part of the motion. Beyond half a
     period the samples alias, but along a measured angle each order still has its own pattern."""
     moving = _moving(tangent.fit)
-    return int(np.clip(1.8 * np.pi / np.quantile(moving, SLOW_PART), 0, HIGHEST)) if moving.size else 0
+    return int(np.clip(LESS_THAN_A_PERIOD / np.quantile(moving, SLOW_PART), 0, HIGHEST)) if moving.size else 0
 
 
 def shows_turns(fit: Fit) -> bool:
     """Tell whether a part of the motion, if known, is so slow that samples show what comes once a turn."""
-    return bool(np.quantile(moving, SLOW_PART) < 1.8 * np.pi) if (moving := _moving(fit)).size else True
+    return bool(np.quantile(moving, SLOW_PART) < LESS_THAN_A_PERIOD) if (moving := _moving(fit)).size else True
 
 
 def _moving(fit: Fit) -> Array:

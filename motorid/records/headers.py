@@ -63,9 +63,10 @@ def parse_unit(text: str) -> Unit | None:
     return Unit(dimension, factor, SI[dimension], label, -273.15 if word in ("k", "kelvin") else 0.0)
 
 
-def require_unit(text: object, channel: str) -> Unit:
-    """Read the unit that a user gave for a channel; a number may touch it (0.047V), which in a header is a name."""
-    if channel == "v" and (pulse := _pulse(str(text))) is not None:
+def require_unit(text: object, channel: str, pulses: bool = True) -> Unit:
+    """Read the unit that a user gave for a channel; a number may touch it (0.047V), which in a header is a name.
+    `pulses`: a time may be the width of a servo's pulses."""
+    if pulses and channel == "v" and (pulse := _pulse(str(text))) is not None:
         return pulse
     unit = parse_unit(re.sub(r"(?i)^((?>[-+]?[\d.]+(?:e[-+]?\d+)?))(?=[a-z°%µμ])", r"\1 ", str(text)))
     allowed = DIMENSIONS[channel]
@@ -87,7 +88,7 @@ def _pulse(text: str) -> Unit | None:
     """Read the width of a servo's or speed controller's pulse as a command: 1000 to 2000 µs are −1 to 1; what is 0 may
     stand behind a colon (``us:1000``)."""
     label = text.strip("[](){}<> \t")
-    if not (found := re.fullmatch(r"([um])s(?:ec)?(?::([\d.]+))?", label.translate(_LETTERS).lower())):
+    if not (found := re.fullmatch(r"([um])s(?:ec)?(?::(\d+\.?\d*))?", label.translate(_LETTERS).lower())):
         return None
     size = {"u": 1e-6, "m": 1e-3}[found[1]] / 5e-4
     return Unit("ratio", size, SI["ratio"], label, -size * float(found[2]) if found[2] else -3.0)

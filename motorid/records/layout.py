@@ -105,13 +105,11 @@ def _named_by_user(labels: Sequence[str], columns: Mapping[str, object], units: 
             continue
         label = _find(labels, column)
         unit = row[label] or headers.unit_in(label)[1]
-        if unit and channel == "v" and unit.dimension == "time":  # a servo's pulse
-            unit = headers.require_unit(unit.label, channel)
         if unit and unit.dimension not in DIMENSIONS[channel]:
             named = headers.classify(label, row[label])  # u_a is in no ampere, current_A is
-            if not {channel, label} & set(units) and ((named and named.unit) or headers.unit_in(label)[2]):
-                headers.require_unit(unit.label, channel)
-            unit = None
+            sure = (named and named.unit) or headers.unit_in(label)[2]
+            unit = None if {channel, label} & set(units) or not sure else headers.require_unit(
+                unit.label, channel, pulses=named is None or named.channel != "t")
         places[channel] = Place(label, unit or _default(channel), unit is not None)
     taken = [p.column for p in places.values()]
     if twice := [label for label in taken if taken.count(label) > 1]:

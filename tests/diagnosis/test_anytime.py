@@ -205,6 +205,36 @@ def test_what_comes_in_the_place_of_two_leaves_room_for_another(monkeypatch):
     assert last.text == "stopped at the limit of 3 effects"
 
 
+def test_a_model_that_was_led_out_of_a_valley_is_the_one_to_go_on_from(monkeypatch):
+    """What only led it out is not taken, and its round does not count; where it leaves noise the loop is done."""
+    def node(key=frozenset(), parent=None):
+        return SimpleNamespace(key=key, added=max(key, default=None), fit=None, parent=parent)
+
+    root, expanded = node(), []
+    stuck = node(frozenset("a"), root)
+    out = node(frozenset("a"), root)
+
+    def expand(best):
+        expanded.append(best)
+        return [stuck if best is root else node(best.key | {"b"}, best)], []
+
+    search = SimpleNamespace(
+        root=root, stages=SimpleNamespace(round=lambda k: None, done=lambda words: None), effects=(), nodes={},
+        brought_to_its_end=lambda new: new, expand=expand, stopped="", pruned=lambda new, best: new,
+        scores=lambda new: [], led_out=lambda best, new: out if best is stuck else best,
+        exchanged=lambda new, best: new)
+    for name, instead in {"at_noise": lambda best: best is out, "far": lambda fit: [],
+                          "_better": lambda some, best: (next(iter(some)), list(some)), "group_of": lambda *_: (),
+                          "judge_adequacy": lambda best, *_: SimpleNamespace(adequate=best is out)}.items():
+        monkeypatch.setattr(stepwise, name, instead)
+    begun = stepwise.Climb(search, (root,), (), (), "", None, SimpleNamespace(adequate=False))
+    *_, last = stepwise._rounds(begun, 3)
+    assert expanded == [root, stuck]
+    assert last.path == (root, out)
+    assert len(last.rounds) == 1
+    assert last.text == "stopped: what remains is noise"
+
+
 @pytest.mark.parametrize("noise", [True, False])
 def test_curves_are_asked_where_held_out_runs_hold_more_than_noise(monkeypatch, noise):
     """A battery that polarises was fitted to its noise by three effects, and missed by three times that elsewhere."""

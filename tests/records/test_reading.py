@@ -463,9 +463,17 @@ def test_the_pulses_of_a_servo_are_a_command(tmp_path):
     table["Servo 3 (µs)"] /= 1000
     wide = read_csv(_written(table, tmp_path), columns={"v": 2}, units={"v": "ms"})
     assert wide.inputs["v"] == pytest.approx(run.inputs["v"])
-    for unit in ("h", "us:x"):
+    for unit in ("h", "us:x", "us:1.5.0", "us:."):
         with pytest.raises(DataError, match=r"cannot be in|unknown unit"):
             read_csv(path, columns={"v": 2}, units={"v": unit})
+    for header in ("time_ms", "time_us", "Zeit (ms)"):  # the wrong column, and no pulse
+        path = _written(table.assign(**{header: table["t"] * 1000}), tmp_path)
+        with pytest.raises(DataError, match="that is a time"):
+            read_csv(path, columns={"v": header})
+    path = _written(table.assign(**{"Servo 3 (s)": 3.0}), tmp_path)
+    with pytest.raises(DataError, match="that is a time"):
+        read_csv(path, columns={"v": "Servo 3 (s)"})
+    assert read_csv(path, columns={"v": "Servo 3 (s)"}, units={"v": "V"}).inputs["v"][0] == 3.0
 
 
 def _written(table, folder):
