@@ -1,7 +1,5 @@
 """The computer's end of the protocol: ask, wait, ask again if an answer got lost; and the serial link under it."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import math
@@ -26,7 +24,7 @@ BATCH = 0.004  # s between two reads: bytes are gathered, so that 5,000 lines do
 class Client:
     """Talks to a device over a link."""
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: "Link") -> None:
         self.link = link
         self.decoder = Decoder()
         self.inbox: list[Sample | Message] = []  # came while an answer was awaited, and is not it

@@ -16,8 +16,6 @@ On the line a segment is ``R,<ms>,<mV from>,<mV to>``, ``C,<ms>,<mV offset>,<mV 
 ``P,<ms>,<mV offset>,<mV amplitude>,<µs per bit>,<seed>``, all whole, so device and computer mean the same program.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -110,7 +108,7 @@ class Program:
             index -= n
         return None
 
-    def after(self, seconds: float) -> Program:
+    def after(self, seconds: float) -> "Program":
         """What is left after that time; a segment that was interrupted is repeated from its start."""
         ends = accumulate(s.ms / 1e3 for s in self.segments)
         return Program(tuple(s for s, end in zip(self.segments, ends, strict=True) if end > seconds), self.words)

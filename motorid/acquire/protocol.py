@@ -28,8 +28,6 @@ From the computer
 A device that hears no valid frame for one second switches the motor off. A command may be repeated without harm.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from binascii import crc_hqx
@@ -130,7 +128,7 @@ class Header:
                 *(f"{c.name}:{c.unit}:{c.scale:.9g}:{c.offset:.9g}:{c.kind}" for c in self.channels))
 
     @classmethod
-    def read(cls, fields: list[str]) -> Header:
+    def read(cls, fields: list[str]) -> "Header":
         """Make a header from the fields of its frame; DeviceError for another version, or what cannot be."""
         if len(fields) < 2 or fields[1] != str(VERSION):
             raise DeviceError(f"the device speaks version {''.join(fields[1:2]) or '?'} of the protocol, "

@@ -1,7 +1,5 @@
 """Serve a virtual device in real time: the loop, its transport (pseudo-terminal or socket), and faults on the wire."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select
@@ -34,7 +32,7 @@ class Pace:
     once: bool = False  # whether to end when the first run is over and the recorder has gone
 
 
-def serve(make: Callable[[], VirtualDevice], transport: Transport, wire: Wire, pace: Pace,
+def serve(make: Callable[[], VirtualDevice], transport: "Transport", wire: "Wire", pace: Pace,
           stop: Callable[[], bool] = lambda: False) -> VirtualDevice:
     """Serve devices made by `make` until `stop()` says so; return the last one."""
     bench = _Bench(make, transport, wire, pace)
@@ -50,7 +48,7 @@ def serve(make: Callable[[], VirtualDevice], transport: Transport, wire: Wire, p
 class _Bench:
     """One turn after the other: hear, run, speak."""
 
-    def __init__(self, make: Callable[[], VirtualDevice], transport: Transport, wire: Wire, pace: Pace) -> None:
+    def __init__(self, make: Callable[[], VirtualDevice], transport: "Transport", wire: "Wire", pace: Pace) -> None:
         self.make, self.transport, self.wire, self.pace = make, transport, wire, pace
         self.device = make()
         self.plugged, self.over = True, False

@@ -1,7 +1,5 @@
 """A recording session: take what comes, keep the device awake, notice every way in which it can end."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import threading
@@ -52,7 +50,7 @@ class Session:
     total: float | None  # s, of the program or until stopped
     duration: float | None  # s after which to stop
     timeout: float
-    progress: Callable[[Progress], None] | None
+    progress: "Callable[[Progress], None] | None"
 
     def __post_init__(self) -> None:
         self.ended, self.detail = "", ""
@@ -67,7 +65,7 @@ class Session:
         self._reported = self._heard, 0, 0.0  # clock, samples and device time of the last report
         self.timeline = Timeline(self.header, counter, micros, self._heard)
 
-    def run(self) -> Recording:
+    def run(self) -> "Recording":
         """Record to the end."""
         try:
             with _stop_by_signal(lambda: self._end("interrupted")):
@@ -156,7 +154,7 @@ class Session:
                 came = self.client.receive(0.05)
                 self._take([i for i in came if self.ended != "disk" or isinstance(i, Message)], time.monotonic())
 
-    def _close(self) -> Recording:
+    def _close(self) -> "Recording":
         self.client.decoder.close()
         if self.ended != "disk":
             try:
@@ -169,7 +167,7 @@ class Session:
                 self.ended, self.detail = "disk", error.strerror or str(error)
         return self._outcome()
 
-    def _outcome(self) -> Recording:
+    def _outcome(self) -> "Recording":
         timeline, received = self.timeline, self.timeline.received
         lost = max(timeline.lost, (self.made or 0) - received)
         seconds = self.last.time + 1 / self.header.rate if self.last else 0.0

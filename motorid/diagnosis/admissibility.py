@@ -154,8 +154,7 @@ def _emptied(fit: Fit, added: Effect, before: Fit) -> str:
 def _belied(fit: Fit, added: Effect) -> str:
     """Say so where the speed and the angle, as measured, agree better without an effect of the speed's sensor.
 
-    What a sensor, late by T, makes of a turn Δθ adds up to (1 + k_w)·Δθ − T·Δω + w_0·Δt, whatever moves the motor.
-    """
+    What a sensor, late by T, makes of a turn Δθ adds up to (1 + k_w)·Δθ − T·Δω + w_0·Δt, whatever moves the motor."""
     known = {"k_w": 1.0, "w_0": 1.0, "T_w": 1.0, "T_d": 1.0, "T_a": 0.5}
     own, errors = {p.name for p in added.parameters} & set(known), {True: 0.0, False: 0.0}
     for run in (r for r in fit.problem.experiments if own and {"omega", "theta"} <= set(r.outputs)):

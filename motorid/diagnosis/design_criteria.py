@@ -11,8 +11,6 @@ parameters over the record. What earlier records tell enters as a Gaussian prior
   direction of the parameters each, of the exact slopes with respect to the levels.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -72,7 +70,7 @@ class Rival:
     fitted: Array  # (k,) from the model's values to the fitted ones, where these are others; see `as_allowed`
 
     @staticmethod
-    def of(fit: Fit) -> Rival:
+    def of(fit: Fit) -> "Rival":
         """Return the rival that a fit is."""
         problem, k = fit.problem, len(fit.problem.unknowns.free)
         runs = problem.experiments
@@ -91,7 +89,7 @@ class Rival:
                      problem.scaling.scale[:k], known, seen, np.zeros(k))
 
     @staticmethod
-    def as_allowed(fit: Fit) -> Rival:
+    def as_allowed(fit: Fit) -> "Rival":
         """Return the rival that a fit is, an effect that its records leave open as large as they allow: as fitted it
         may be nothing. Of sizes on a grid the one that, all else fitted anew, raises χ² most, by `REGION`² at most."""
         problem, names = fit.problem, [p.name for p in fit.problem.unknowns.free]
@@ -114,7 +112,7 @@ class Rival:
         moved = replace(fit, values=problem.values(q), q=q, residuals=r, jacobian=jac / problem.scaling.slope(q))
         return replace(Rival.of(moved), fitted=(fit.q - q)[:len(names)])
 
-    def smoothed(self, width: float) -> Rival:
+    def smoothed(self, width: float) -> "Rival":
         """Return it with sgn at least so wide (rad/s): a sharp reversal makes criteria rough in the voltage."""
         own = self.model.values.get("sgn_width", np.inf)
         return self if own >= width else replace(self, model=self.model.replace(sgn_width=width))
@@ -153,7 +151,7 @@ class Rival:
                 "seen": dict(self.seen), "fitted": self.fitted.tolist()}
 
     @staticmethod
-    def from_dict(contents: Mapping[str, Any], model: Model) -> Rival:
+    def from_dict(contents: Mapping[str, Any], model: Model) -> "Rival":
         """Return what `to_dict` wrote, its model built already."""
         sigma, seen = ({str(k): float(v) for k, v in contents[part].items()} for part in ("sigma", "seen"))
         scale, information, fitted = (np.asarray(contents[part], float) for part in ("scale", "information", "fitted"))
@@ -295,7 +293,7 @@ class Driven:
     substeps: NDArray[np.int64]
 
     @staticmethod
-    def of(rival: Rival, layout: Layout, errors: Mapping[str, float], angle: bool) -> Driven:
+    def of(rival: Rival, layout: Layout, errors: Mapping[str, float], angle: bool) -> "Driven":
         """Return it with one integration step per sample."""
         system = rival.model.system({*errors, *(("theta",) if angle else ())})
         if system.inputs != ("v",):
@@ -349,7 +347,7 @@ class Driven:
             raise SimulationError("a rival grows without bound under this voltage.")
         return Response(x, y / self.errors, dx, dy / self.errors[:, None])
 
-    def refined(self, levels: Array, tolerance: float) -> Driven:
+    def refined(self, levels: Array, tolerance: float) -> "Driven":
         """Return it with sub-steps that keep the integration's error under this voltage below `tolerance`."""
         p, _ = self.parameters(np.zeros(len(self.rival.scale)))
         grid = replace(self, substeps=np.ones_like(self.substeps)).grid(levels)
@@ -461,12 +459,12 @@ class Task:
         """How levels become a voltage."""
         return self.driven[0].layout
 
-    def laid(self, layout: Layout) -> Task:
+    def laid(self, layout: Layout) -> "Task":
         """Return the task with another layout, one integration step per sample."""
         ones = np.ones(int(layout.edges[-1]), int)
         return replace(self, driven=tuple(replace(d, layout=layout, substeps=ones) for d in self.driven))
 
-    def refined(self, levels: Array, tolerance: float) -> Task:
+    def refined(self, levels: Array, tolerance: float) -> "Task":
         """Return the task with integration steps that suit `levels`."""
         return replace(self, driven=tuple(d.refined(levels, tolerance) for d in self.driven))
 
@@ -555,8 +553,7 @@ def climb(task: Task, c: Array) -> Found:
     The information is convex in a linear motor's voltage, so that its maxima lie where limits are active, and a linear
     program goes there at once (Fletcher & Sainz de la Maza, Mathematical Programming 43, 1989); the trust region
     shrinks where the step does not keep its promise. Limits of the states hold at the largest and the smallest value
-    of each segment. A budget of time or Ctrl-C ends the search at the best point so far.
-    """
+    of each segment. A budget of time or Ctrl-C ends the search at the best point so far."""
     linear, radius, best = linear_rows(task), RADIUS, Found(task, c, -np.inf)
     try:
         values, slopes, states = _linearised(task, c, True)

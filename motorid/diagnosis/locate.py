@@ -1,7 +1,5 @@
 """Where does the model fail? The missing voltage and torque over time, by balance, by region, by quantity."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -86,7 +84,7 @@ def _region(regions: Mapping[str, float]) -> str:
     return f"{100 * regions[first]:.0f} % of the squared error lies in {place}."
 
 
-def _signals(fit: Fit, k: int, s: Smoothed) -> Mapping[str, Array]:
+def _signals(fit: Fit, k: int, s: "Smoothed") -> Mapping[str, Array]:
     run, states = fit.problem.experiments[k], fit.problem.system.states
     told = ("i", "omega") if "i" in fit.problem.outputs else ("omega",)  # a current that was not measured tells nothing
     found = {"t": run.t - run.t[0], "v": run.inputs["v"], **{c: s.x[:, states.index(c)] for c in told if c in states}}

@@ -131,8 +131,7 @@ def chosen_functions(fit: Fit, linear: Linear, form: Form, chosen_before: Iterab
     is left. Of the sets passed the smallest that predicts within one standard error of the best is taken (Breiman et
     al., Classification and Regression Trees, 1984, 3.4), if it is worth it. What the model's own parameters do already
     is no function of its own. The waves of a narrow dip help only together, so sets are passed as long as one function
-    more takes what no noise would give to the best of so many (Donoho & Johnstone, Biometrika 81(3), 1994).
-    """
+    more takes what no noise would give to the best of so many (Donoho & Johnstone, Biometrika 81(3), 1994)."""
     answers = Answers(fit, linear, form)
     before = answers.predictions(())
     if before is None:
@@ -278,8 +277,7 @@ def _insignificant(last: Node, effect: Effect, structure: bool, root: Node,
     """Say so where every size of an effect is within two deviations of nothing, and without it the error hardly rises.
 
     One without a deviation may be any; of a law whose sizes are all open, as voltages too where no current is known,
-    little is known, unless it leaves noise, as the first model does not, and the error falls plainly by its size.
-    """
+    little is known, unless it leaves noise, as the first model does not, and the error falls plainly by its size."""
     fit, own = last.fit, [p for p in effect.parameters if last.fit.problem.model.parameters[p.name].vary]
     sizes = [p.name for p in own if p.null == 0]
     found = [(fit.values[n], fit.std[n]) for n in sizes]

@@ -3,8 +3,6 @@
 On a tie the smaller model wins, then the effect that is met more often.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, reduce
@@ -34,7 +32,7 @@ class Node:
     fit: Fit
     added: str | None
     predictions: Predictions
-    parent: Node | None = None
+    parent: "Node | None" = None
     objection: str = ""
     reason: str = ""
 

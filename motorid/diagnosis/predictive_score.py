@@ -10,8 +10,6 @@ Student's t, with each model's own scale per channel from the other blocks: the 
 the sensor, sets what counts. Coloured errors repeat themselves; a channel counts by the effective share of its samples.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -345,7 +343,7 @@ class HeldOut:
     noise: Mapping[str, float]  # of each channel's sensor, SI
 
     @staticmethod
-    def of(fit: Fit, validate: Sequence[Experiment] | Experiment | None) -> HeldOut:
+    def of(fit: Fit, validate: Sequence[Experiment] | Experiment | None) -> "HeldOut":
         """Prepare the judgement for models of `fit`'s records."""
         noise = {c: s for run in fit.problem.runs for c, s in run.sigma.items()}
         if validate is None:

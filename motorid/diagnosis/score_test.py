@@ -6,8 +6,6 @@ score test in the sense of Rao (1948), without refitting anything. Shape paramet
 that cannot be differentiated at their null are simulated at a few finite shapes instead.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -51,7 +49,7 @@ class Score:
     effective: float = 0.0
     same_as: tuple[str, ...] = ()
     stands_out: bool = False
-    shapes: tuple[Shape, ...] = ()
+    shapes: "tuple[Shape, ...]" = ()
 
 
 class Tried(NamedTuple):
@@ -170,7 +168,7 @@ def score(tangent: Tangent, effect: Effect) -> Score:
     return _scored(tangent, effect, tuple(s for values in grid if (s := added.shape(values)) is not None))
 
 
-def _scored(tangent: Tangent, effect: Effect, shapes: tuple[Shape, ...]) -> Score:
+def _scored(tangent: Tangent, effect: Effect, shapes: "tuple[Shape, ...]") -> Score:
     """Score an effect by what it adds at several shapes."""
     pairs = sorted(((_tried(tangent, s), s) for s in shapes), key=lambda pair: -pair[0].drop)
     if not pairs:
@@ -184,7 +182,7 @@ def _scored(tangent: Tangent, effect: Effect, shapes: tuple[Shape, ...]) -> Scor
     return Score(effect, drop, starts, effective, same_as, shapes=shapes)
 
 
-def _score_orders(tangent: Tangent, added: Added, effect: Effect) -> Score:
+def _score_orders(tangent: Tangent, added: "Added", effect: Effect) -> Score:
     """Score an effect of the angle at its likely orders, which the misfit without its colour tells."""
     lines = likely_lines(tangent, effect, ORDERS_TRIED)
     order = next(p.name for p in added.pars if p.order)
@@ -205,7 +203,7 @@ def _distinct(starts: list[dict[str, float]], most: int = 3) -> list[dict[str, f
     return kept[:most]
 
 
-def _tried(tangent: Tangent, shape: Shape) -> Tried:
+def _tried(tangent: Tangent, shape: "Shape") -> Tried:
     """Score one shape, physical signs enforced."""
     drop, amounts, left = tangent.explained(shape.columns, shape.nonnegative)
     if not shape.sizes:
@@ -243,7 +241,7 @@ class Shape:
         """Which columns may not count negatively."""
         return [False, False] if self.phase is not None else [p.lower == 0 for p in self.sizes] or [True]
 
-    def weighed_like(self, fit: Fit) -> Shape:
+    def weighed_like(self, fit: Fit) -> "Shape":
         """Return the shape with the channels weighed as in another fit of the same records."""
         new = tuple(m.weights for m in fit.problem.measured)
         if all(map(np.array_equal, new, self.weights)):
@@ -263,7 +261,7 @@ class Added:
     natural: Mapping[str, float]  # natural size per unit
 
     @staticmethod
-    def of(tangent: Tangent, effect: Effect) -> Added:
+    def of(tangent: Tangent, effect: Effect) -> "Added":
         """Return the fit's model with `effect`, a first one over the angle along that measured; ModelError if unfit."""
         fit, model = tangent.fit, tangent.fit.model + effect
         if uses_angle(effect) and not model.angle_input and not any(uses_angle(e) for e in fit.model.effects):

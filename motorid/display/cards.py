@@ -1,7 +1,5 @@
 """Tables and cards: what a result shows of itself, as text and as HTML."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from html import escape
@@ -56,13 +54,13 @@ class Table:
         body.insert(1, "  ".join("─" * w for w in widths))
         return "\n".join([part for part in (self.title, *body, self.note) if part])
 
-    def turned(self) -> Table:
+    def turned(self) -> "Table":
         """Return the table with rows and columns exchanged."""
         header, *rows = zip(self.header, *self.rows, strict=True)
         return replace(self, header=header, rows=rows, left=(0,))
 
     @property
-    def on_page(self) -> Table:
+    def on_page(self) -> "Table":
         """The table as a page shows it: turned where it would be wider than a phone, and has few rows."""
         return self.turned() if len(self.header) > WIDE > len(self.rows) else self
 

@@ -6,8 +6,6 @@ Models from Sampled Data, 2008, ch. 1). A current or a speed that was not measur
 is taken as given, or round. Torques of the model's effects are further columns.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -71,7 +69,7 @@ def _windowed(columns: Sequence[Array], target: Array, windows: int = 20) -> tup
     return np.column_stack([c[w:] - c[:-w] for c in columns]), target[w:] - target[:-w]
 
 
-def _solve(rows: list[tuple[Array, Array]], names: Sequence[str | Load], held: Mapping[Any, float]) -> dict[Any, float]:
+def _solve(rows: list[tuple[Array, Array]], names: "list[str | Load]", held: Mapping[Any, float]) -> dict[Any, float]:
     """Non-negative least squares with some coefficients known; zeros of the motor become small positive numbers."""
     a, b = np.vstack([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
     known = {n: held[n] for n in names if n in held}
@@ -99,7 +97,7 @@ def _nonnegative(a: Array, b: Array, signed: NDArray[np.bool_]) -> Array:
     return np.zeros(len(signed))
 
 
-def _full(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict[str, float]:
+def _full(signals: list[dict], held: Mapping[str, float], loads: "_Loads") -> dict[str, float]:
     electrical = [_windowed([s["i"], s["i_dt"], s["omega_dt"]], s["v_dt"], 200) for s in signals]
     found = _solve(electrical, ["L", "R", "K"], held)
     mechanical = [_windowed([s["omega"], s["omega_dt"], *loads.integrals(s, {**found, "b": 0.0, "J": 1.0})],
@@ -113,14 +111,14 @@ def _rings(motor: Mapping[str, float], signals: list[dict]) -> bool:
     return (k * dt / np.pi) ** 2 > (lj := motor["L"] * j) and (r * j + b * motor["L"]) * dt < 2 * lj
 
 
-def _torque_driven(signals: list[dict], held: Mapping[str, float], loads: _Loads) -> dict[str, float]:
+def _torque_driven(signals: list[dict], held: Mapping[str, float], loads: "_Loads") -> dict[str, float]:
     g = held.get("g", 1.0)
     rows = [_windowed([s["omega"], s["omega_dt"], *loads.integrals(s, {"g": g, "b": 0.0, "J": 1.0})], g * s["v_dt"])
             for s in signals]
     return {"g": g} | loads.split(_solve(rows, ["J", "b", *loads.loads], held))
 
 
-def _without_current(signals: list[dict], held: Mapping[str, float], loads: _Loads,
+def _without_current(signals: list[dict], held: Mapping[str, float], loads: "_Loads",
                      back_emf: float) -> dict[str, float]:
     """``∫v = (RJ/K) Δω + (K + Rb/K) ∫ω + (R/K) ∫load``: two numbers and the loads; the rest is assumed."""
     unit = {"R": 1.0, "L": 1.0, "K": 1.0, "b": 0.0, "J": 1.0}

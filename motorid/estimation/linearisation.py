@@ -3,8 +3,6 @@
 Along the model's own trajectory, ``δx⁺ = A δx + B d`` and ``δy = C δx`` with d = (voltage, torque) held over a sample.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -169,7 +167,7 @@ class Tangent:
 
     @staticmethod
     @lru_cache(maxsize=4)  # what is cached by a tangent, as the spectrum of orders, is found again
-    def of(fit: Fit) -> Tangent:
+    def of(fit: Fit) -> "Tangent":
         """Return the tangent space of `fit`, singular directions left out."""
         jac, r = (a[: fit.problem.n_outputs] for a in (fit.jacobian, fit.residuals))
         norms = np.linalg.norm(jac, axis=0)

@@ -1,7 +1,5 @@
 """The input of one record laid out for an engine, and what an engine gives back."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -25,7 +23,7 @@ class Grid:
     substeps: NDArray[np.int64]  # (N-1,), Rosenbrock steps per interval
 
     @staticmethod
-    def of(t: Array, u: Array, held: NDArray[np.bool_]) -> Grid:
+    def of(t: Array, u: Array, held: NDArray[np.bool_]) -> "Grid":
         """Lay out inputs `u` (N, nu); `held` (nu,) tells which stay constant between samples."""
         u = np.ascontiguousarray(u, float)
         return Grid(np.ascontiguousarray(t, float), u, np.ascontiguousarray(u[:-1]),
@@ -44,11 +42,11 @@ class Grid:
     def __getstate__(self) -> dict[str, Any]:
         return {f: getattr(self, f) for f in self.__dataclass_fields__}  # addresses mean nothing elsewhere
 
-    def with_substeps(self, substeps: NDArray[np.int64]) -> Grid:
+    def with_substeps(self, substeps: NDArray[np.int64]) -> "Grid":
         """Return the grid with other sub-steps."""
         return replace(self, substeps=np.ascontiguousarray(substeps, np.int64))
 
-    def part(self, a: int, b: int) -> Grid:
+    def part(self, a: int, b: int) -> "Grid":
         """Return samples a to b, both included."""
         return Grid(self.t[a:b + 1], self.u[a:b + 1], self.u0[a:b], self.u1[a:b], self.substeps[a:b])
 

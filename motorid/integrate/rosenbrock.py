@@ -1,7 +1,5 @@
 """The default engine: fixed Rosenbrock sub-steps per sample, compiled where a C compiler is there."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ spaced samples under one constant input are walked in one go over scaled time, b
 without `quad_err_con` CasADi's CVODES interface can return wrong ones silently (casadi issue 4383).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -57,7 +55,7 @@ class _Sundials(Engine):
         y, dy = stepper(system).machine.observe(grid, x, dx if nq else None, p, dp)
         return Trajectory(y, dy, x, dx if nq else None, None)
 
-    def _walk(self, integrators: _Integrators, grid: Grid, first: int, count: int, *rest: Any) -> None:
+    def _walk(self, integrators: "_Integrators", grid: Grid, first: int, count: int, *rest: Any) -> None:
         x = rest[0]
         try:
             integrators.walk(grid, first, count, *rest)

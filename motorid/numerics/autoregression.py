@@ -4,8 +4,6 @@ An autoregression needs few numbers for noise whose neighbours are alike, and it
 truncated sample autocovariance is not (Percival & Walden, Spectral Analysis for Physical Applications, 1993, ch. 9).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -78,7 +76,7 @@ class Whitening:
     filters: tuple[Array, ...]
 
     @staticmethod
-    def of(residuals: Sequence[Array]) -> Whitening:
+    def of(residuals: Sequence[Array]) -> "Whitening":
         """Return the filters for `residuals`, one (N, ny) per run, NaN where missing."""
         found = []
         for j in range(residuals[0].shape[1]):

@@ -11,8 +11,6 @@ Damping by ‖r‖² converges globally, and quadratically even where J is singu
 factor of ten 99 end in the optimum, 75 to 94 with the column norms; see `motorid.estimation.restarts`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -61,7 +59,7 @@ class LevenbergMarquardt:
             if not 0 <= value < np.inf:
                 raise UsageError(f"LevenbergMarquardt takes numbers of at least zero; {name} is {value!r}.")
 
-    def at_most(self, other: LevenbergMarquardt) -> LevenbergMarquardt:
+    def at_most(self, other: "LevenbergMarquardt") -> "LevenbergMarquardt":
         """Return these options, ending no later than `other`."""
         return replace(self, max_iterations=min(self.max_iterations, other.max_iterations),
                        ftol=max(self.ftol, other.ftol), xtol=max(self.xtol, other.xtol))

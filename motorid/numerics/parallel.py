@@ -4,8 +4,6 @@
 ``client.get_executor(pure=False).map`` of Dask, ``lambda f, xs: joblib.Parallel(2)(joblib.delayed(f)(x) for x in xs)``.
 """
 
-from __future__ import annotations
-
 import builtins
 import hashlib
 import os
@@ -45,7 +43,7 @@ class OneThread(ContextDecorator):
         self._lock, self._owner, self._depth = threading.Lock(), 0, 0
         self._limit: AbstractContextManager[Any] | None = None
 
-    def __enter__(self) -> OneThread:
+    def __enter__(self) -> "OneThread":
         with self._lock:
             if not self._depth:
                 self._owner = threading.get_ident()
@@ -172,7 +170,7 @@ class Parcel:
     data: bytes = field(compare=False, repr=False)
 
     @staticmethod
-    def of(content: Any) -> Parcel:
+    def of(content: Any) -> "Parcel":
         """Pack `content`."""
         data = pickle.dumps(content, protocol=pickle.HIGHEST_PROTOCOL)
         return Parcel(hashlib.sha256(data).hexdigest(), data)

@@ -225,5 +225,4 @@ def gather(found: Sequence[tuple[Array, NDArray[np.bool_]]]) -> bool:
         return False
     waves = [np.exp(1j * np.outer(angle, np.arange(1, 13))) for angle, _ in found]
     some = np.concatenate([w[chosen] for w, (_, chosen) in zip(waves, found, strict=True)])
-    apart = np.abs(some.mean(axis=0) - np.concatenate(waves).mean(axis=0)) ** 2
-    return bool(len(some) * apart.max() > 12)
+    return bool(len(some) * np.max(np.abs(some.mean(axis=0) - np.concatenate(waves).mean(axis=0)) ** 2) > 12)

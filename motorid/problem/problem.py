@@ -1,7 +1,5 @@
 """A fitting problem: model, records and what is asked of them, as residual(q) and jacobian(q)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -172,7 +170,7 @@ class Problem:
     def __getstate__(self) -> dict[str, Any]:
         return {n: v for n, v in self.__dict__.items() if n != "_latest"}
 
-    def refined(self, q: Array) -> Problem:
+    def refined(self, q: Array) -> "Problem":
         """Return the problem with sub-steps that keep the integration error below noise and misfit at `q`."""
         at = self.unknowns.point(np.asarray(q, float))
         if (known := self._latest.get("refined")) is None or not np.array_equal(known[0], at.q):
@@ -199,7 +197,7 @@ class Problem:
         grid = self.integrator.prepare(self.system, coarse, x0, at.p, self._tolerance(k))
         return run if np.array_equal(grid.substeps, run.grid.substeps) else replace(run, grid=grid)
 
-    def with_finer_steps(self, factor: int) -> Problem:
+    def with_finer_steps(self, factor: int) -> "Problem":
         """Return the problem with `factor` times as many sub-steps everywhere."""
         return self.with_runs(tuple(replace(r, grid=r.grid.with_substeps(factor * r.grid.substeps)) for r in self.runs))
 
@@ -208,7 +206,7 @@ class Problem:
         """Tell whether it takes no more sub-steps than its samples are worth."""
         return sum(int(run.grid.substeps.sum()) for run in self.runs) <= self._most_steps
 
-    def within_worth(self) -> Problem:
+    def within_worth(self) -> "Problem":
         """Return the problem with an engine that gives up where one record takes more sub-steps than that."""
         return self.tuned(engine=limited(self.integrator, self._most_steps))
 
@@ -216,11 +214,11 @@ class Problem:
     def _most_steps(self) -> int:
         return max(SUBSTEPS * sum(r.n for r in self.experiments), CHEAP)
 
-    def with_runs(self, runs: tuple[Run, ...]) -> Problem:
+    def with_runs(self, runs: tuple[Run, ...]) -> "Problem":
         """Return a copy with other grids that keeps everything else already made."""
         return self._lending(replace(self, _runs=runs), ("outputs", "system", "unknowns", "integrator", "measured"))
 
-    def _lending(self, other: Problem, made: Sequence[str]) -> Problem:
+    def _lending(self, other: "Problem", made: Sequence[str]) -> "Problem":
         other.__dict__.update({n: self.__dict__[n] for n in made if n in self.__dict__})
         return other
 
@@ -229,7 +227,7 @@ class Problem:
         return self.accuracy if self.accuracy is not None else partial(self.measured[k].tolerance, slack=slack)
 
     @cached_property
-    def measured(self) -> tuple[Measured, ...]:
+    def measured(self) -> "tuple[Measured, ...]":
         """The records as residuals see them, one per run."""
         return tuple(Measured.of(run, self.outputs, self.weights, self.noise_factors) for run in self.runs)
 
@@ -286,18 +284,18 @@ class Problem:
         """Number of output residuals (finite measured samples)."""
         return sum(m.size for m in self.measured)
 
-    def for_model(self, model: Model) -> Problem:
+    def for_model(self, model: Model) -> "Problem":
         """Return the problem for another model on the same records; noise, grids, initial states stay."""
         other = replace(self, model=model, _runs=self.runs)
         if (inputs := other.system.inputs) != self.system.inputs:
             other = replace(other, _runs=tuple(with_inputs(run, inputs) for run in self.runs))
         return self._lending(other, ("integrator", "measured")) if other.outputs == self.outputs else other
 
-    def start_at(self, values: Mapping[str, float]) -> Problem:
+    def start_at(self, values: Mapping[str, float]) -> "Problem":
         """Return the problem with `values` as its start, each inside the limits of its parameter."""
         return self.for_model(self.model.start_at(values))
 
-    def begun_at(self, q: Array) -> Problem:
+    def begun_at(self, q: Array) -> "Problem":
         """Return the problem with the values at `q` as its start, those of each run and initial states too."""
         physical = dict(zip([p.name for p in self.unknown], self.scaling.physical(q), strict=True))
         starts, own = [run.start.copy() for run in self.runs], [dict(run.apart) for run in self.runs]
@@ -308,11 +306,11 @@ class Problem:
         runs = tuple(replace(run, start=s, apart=a) for run, s, a in zip(self.runs, starts, own, strict=True))
         return replace(self, model=self.model.start_at(self.values(q)), _runs=runs)
 
-    def tuned(self, **fields: Any) -> Problem:
+    def tuned(self, **fields: Any) -> "Problem":
         """Return the problem with other `noise_factors`, another `width` …; the records stay as prepared."""
         return self._lending(replace(self, **{"_runs": self.runs, **fields}), UNTOUCHED.get("".join(fields), ()))
 
-    def with_(self, **fields: Any) -> Problem:
+    def with_(self, **fields: Any) -> "Problem":
         """Return a copy with some fields changed, e.g. ``with_(model=…)``."""
         return replace(self, **{"_runs": None, **fields})
 
@@ -348,7 +346,7 @@ class Measured(NamedTuple):
     name: str
 
     @staticmethod
-    def of(run: Run, outputs: Sequence[str], weights: str, factors: Mapping[str, float]) -> Measured:
+    def of(run: Run, outputs: Sequence[str], weights: str, factors: Mapping[str, float]) -> "Measured":
         """Return `run` with `weights` ``"noise"``, times the factor of each channel, or ``"rms"``."""
         out = run.experiment.outputs
         y = np.column_stack([out.get(c, np.full(run.experiment.n, np.nan)) for c in outputs])

@@ -1,7 +1,5 @@
 """Records made ready for estimation: `prepare_run` gives a record its noise, its grid and its initial state."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -30,7 +28,7 @@ OFF, SAME = 0.02, 1e-6  # of the largest voltage: as good as none; what averagin
 
 # A record is frozen, and so are its noise and its size.
 _levels: WeakKeyDictionary[Experiment, dict[str, float]] = WeakKeyDictionary()
-_sizes: WeakKeyDictionary[Experiment, _Sizes] = WeakKeyDictionary()
+_sizes: "WeakKeyDictionary[Experiment, _Sizes]" = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)

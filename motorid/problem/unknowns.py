@@ -1,7 +1,5 @@
 """The unknowns q of a problem: free parameters of the model, then estimated initial states, run by run."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -83,7 +81,7 @@ class Unknowns:
         return (*self.free, *(p for _, _, p in self.initial), *(p for _, _, p in self.apart))
 
     @cached_property
-    def scaling(self) -> Scaling:
+    def scaling(self) -> "Scaling":
         """Solver coordinates: logarithmic for positive parameters, else in natural sizes of the records."""
         sizes, natural = [abs(p.value) for p in self.free], dict[str, float]()
         if self.apart or not all(p.positive for p in self.free):
@@ -199,7 +197,7 @@ class Scaling:
     upper: NDArray[np.float64]
 
     @staticmethod
-    def of(parameters: Iterable[Parameter], sizes: ArrayLike | None = None) -> Scaling:
+    def of(parameters: Iterable[Parameter], sizes: ArrayLike | None = None) -> "Scaling":
         """Return the scaling of `parameters`; `sizes` (n,) replaces the size read from their values."""
         pars = list(parameters)
         scale = np.abs(np.array([p.value for p in pars] if sizes is None else sizes, float))
