@@ -67,6 +67,7 @@ PAST = (*(on for on in CHANGES if on.startswith("past ")), "path")
 MEMORIES = 8  # lengths of memory
 TRIPS = (0.02, 0.05, 0.1, 0.2, 0.4)  # of the largest heat: where a fuse or a derating sets in
 PLAY = (0.01, 0.4)  # of the largest value: half of the least and of the largest play
+DAMPED = 0.3  # share of the critical damping with which what swings begins
 LASTING = 10.0  # times the longest run: a memory that forgets nothing in it
 
 
@@ -120,7 +121,7 @@ _PUSHES = (  # words, balance, carrier, quantities
     ("a resistance", "voltage", "i", ("t", "turn", "theta", "omega", "load", "run", "past heat", *COMPUTED_INPUTS)),
     ("a motor constant", "both", "", ("t", "turn", "theta", "omega", "i", "run", "past i", "past size", "most i")))
 FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quantities in _PUSHES for on in quantities),
-         *(Form("a gain of the speed sensor", "sensor", on, "omega", "omega") for on in ("turn", "t")),
+         *(Form("a gain of the speed sensor", "sensor", on, "omega", "omega") for on in ("turn", "t", "i")),
          *(Form("a gain of the current sensor", "sensor", on, "i", "i") for on in ("t", "past heat")),
          *(Form("an error of the angle sensor", "sensor", on, "", "theta")
            for on in ("path", "turn", "theta", "omega", "i")),
@@ -194,8 +195,8 @@ def shown(form: Form, fit: Fit, ranges: Mapping[str, tuple[float, float]]) -> bo
     outputs = set(fit.problem.outputs)
     if form.channel and not (form.channel in outputs and len(outputs) > 1):
         return False  # one sensor needs another to be told wrong
-    if form.channel == "omega" and form.carrier and "theta" not in outputs:
-        return False  # a gain is the motor constant's, unless the motion is measured twice
+    if form.channel == "omega" and form.carrier and not {"theta", form.on} & outputs:
+        return False  # a gain is the motor constant's, unless the motion is measured twice, or that makes torque, too
     if form.on not in ranges or ranges[form.on][0] == ranges[form.on][1] or (
             form.on == "run" and own_levels(fit.problem.experiments)):
         return False
@@ -250,7 +251,7 @@ def functions_of(form: Form, span: Span) -> list[str]:
             trips = [f"ca.fmax({lag} / {top} - {_place(level, 0, 1, '1')}, 0)" for lag in lags if form.on == "past heat"
                      for level in TRIPS]
             return [f"{lag} / {top}" for lag in (*lags, *bent)] + trips + ["1.0"]
-        return lags + bent + _sided(form, lengths, max(abs(low), abs(high)))
+        return lags + bent + _sided(form, lengths, max(abs(low), abs(high))) + _swinging(form, lengths, span.finer)
     if form.on in COMPUTED_INPUTS:
         found = ["1.0"]
         for sign, reach in (("", high), ("-", -low)):
@@ -284,6 +285,19 @@ def _sided(form: Form, lengths: Array, top: float) -> list[str]:
         found += [f"(z - {f}(z, {place}))" for f in ("past", "hold") for place in places]
     rates = top / np.geomspace(lengths[0], lengths[-1], 3 * len(lengths)) if rate else []  # no amplifier is so slow
     return found + [f"(z - {'slew' if sensor else 'ramp'}(z, {_place(r, r / 10, 10 * r, rate)}))" for r in rates]
+
+
+def _swinging(form: Form, lengths: Array, finer: int) -> list[str]:
+    """Return functions of what swings when pushed, a mass on a spring or an LC filter, and of its rate, as source."""
+    z = form.on.removeprefix("past ")
+    if z not in ("v", "i", "omega") or form.channel == z:  # a sensor's own filter is of the library
+        return []
+    direct = (form.balance, z) == ("voltage", "v")  # no parameter of the motor makes that up
+    found, finer = [], min(finer, 3)
+    for w in 1 / np.geomspace(lengths[0] / 2, lengths[-1], finer * len(lengths)):
+        places = f"z, {_place(w, w / 10, 10 * w, 'rad/s')}, {_place(DAMPED / finer, 1e-3, 0.99, '1:damped')}"
+        found += [f"(z - swing({places}))" if direct else f"swing({places})", f"sway({places})"]
+    return found
 
 
 def _along(form: Form, span: Span, low: float, high: float) -> list[str]:
@@ -321,6 +335,7 @@ def _of_size(form: Form, span: Span, low: float, high: float) -> list[str]:
     if (span.finer > 1 and form.on != "load") or form.on == "most i":  # others compare better by few
         smooth += [f"(ca.tanh(({s} - {c}) / {wide}) + ca.tanh(({s} + {c}) / {wide}))" if both else
                    f"ca.tanh(({level} - {c}) / {wide})" for c in knees]
+        smooth += [f"ca.tanh(({sign}{s} - {c}) / {wide})" for sign in sides for c in knees if both]
     if form.channel == form.on:  # what is small is not read
         least = np.geomspace(SOFT, BOTH_WAYS, KNEES * span.finer)
         smooth += [f"{s} * (1 - ca.tanh(({size} - {_place(c, 0, 1)}) / {wide}))" for c in least]
@@ -365,7 +380,7 @@ def memories_of(form: Form, span: Span) -> Array:
     return speed * np.geomspace(shortest, max(longest, 2 * shortest), count)
 
 
-def past(z: Array, along: Array, length: float, initial: float) -> Array:
+def past(z: Array, along: Array, length: complex, initial: float) -> Array:
     """Return `z` (N,) behind a first-order lag over `along` (N,), which grows: a time or a way."""
     from scipy.signal import lfilter  # slow to import, and not needed before
 
@@ -386,6 +401,13 @@ STEPS = {  # from the last value to the next: of what plays, is ramped up and fa
     "drag": lambda last, z, way, dt: z + (last - z) / (1 + abs(last - z) * dt / way)}
 
 
+def swings(z: Array, along: Array, rate: float, damping: float, initial: float) -> tuple[Array, Array]:
+    """Return what swings at `rate` (rad/s), driven by `z` (N,) from rest at `initial`, and its rate over that."""
+    pole = rate * complex(-damping, np.sqrt(1 - damping**2))
+    lagged = past(z, along, -1 / pole, initial)  # x'' = rate² (z − x) − 2 damping rate x' is the pair of its poles
+    return rate**2 / pole.imag * (lagged / -pole).imag, -rate / pole.imag * lagged.imag
+
+
 def _stepped(kind: str, z: Array, t: Array, place: float, last: float) -> Array:
     """Return what follows `z` (N,) from sample to sample, beginning at `last`."""
     every = zip(z.tolist(), np.diff(t, prepend=t[0]).tolist(), strict=True)
@@ -399,6 +421,8 @@ def values_of(functions: Sequence[str], form: Form, signal: Mapping[str, Array])
     names = {"ca": np, "z": z, "m": SimpleNamespace(sign=lambda z: np.tanh(z / signal["width"][0])),
              "past": lambda z, length: past(z, along, length, first)}
     names |= {kind: lambda z, place, kind=kind: _stepped(kind, z, along, place, first) for kind in STEPS}
+    names |= {kind: lambda z, rate, damping, k=k: swings(z, along, rate, damping, first)[k]
+              for k, kind in enumerate(("swing", "sway"))}
     return np.column_stack([np.broadcast_to(np.asarray(eval(_compiled(f), names), float), z.shape) for f in functions])
 
 

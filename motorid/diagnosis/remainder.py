@@ -7,14 +7,12 @@ or sets in, how long it remembers: splines with free knots, Jupp, SIAM J. Numer.
 many on a grid. Where one curve leaves what another predicts, there are several, those before chosen anew beside it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial, reduce
-from itertools import chain, islice, product, takewhile
+from itertools import chain, islice, takewhile
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -69,11 +67,12 @@ OTHER_PLACES = {"1": "where it sets in, a share of the largest", "V": "half of i
                 **dict.fromkeys(("V/s", "rad/s²"), "how fast it rises or follows"),
                 "rad/s": "how fast it swings, or half of its play", "1/rad": "how fast it turns over",
                 "1:wave": "how many to the turn", "rad:phase": "its phase", "rad:wide": "half of its width",
-                "rad:edge": "how wide its edges are", "rad:slip": "how far it slips until what it drags along follows"}
+                "rad:edge": "how wide its edges are", "1:damped": "how much its swing is damped",
+                "rad:slip": "how far it slips until what it drags along follows"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
 CLIPPED = re.compile(r"ca\.fmin\(ca\.fmax\(z, \S+\), \S+\)")
-MEMORY = re.compile(r"((past|play|ramp|slew|hold|drag)\(z, (.*?)\))")
+MEMORY = re.compile(r"((past|play|ramp|slew|hold|drag|swing|sway)\(z, (.*?)\))")
 RATES = {  # of what follows z, with one place
     "past": "(z - {s}) / {p}", "play": "(ca.fmax(z - {p} - {s}, 0) - ca.fmax({s} - z - {p}, 0)) / {step}",
     "ramp": "ca.if_else(z < 0, -1, 1) * (ca.fmin({p}, (ca.fabs(z) - ca.if_else(z < 0, -{s}, {s})) / {step})"
@@ -84,7 +83,8 @@ RATES = {  # of what follows z, with one place
 FOLLOWS = {"play": "what a play of {} either way takes", "ramp": "what it is ahead of one that rises by at most {}",
            "slew": "what it is ahead of one that changes by at most {}",
            "hold": "what it is behind one that falls late, within {}",
-           "drag": "the square of the slip against what follows within {}"}
+           "drag": "the slip against what follows within {}",
+           "past": "one lag of {}", "swing": "a swing at {}", "sway": "a swing at {}"}
 POSITIVE = "ca.fmax(curve, -0.5) - 0.25 / ca.fmin(curve, -0.5) - 0.5"  # above -1, smooth; from -0.5 on as it is
 CARRIERS = {"": "", "direction": "m.sign(m.omega) * ", "omega": "m.omega * ", "i": "m.i * ", "v": "m.v * "}
 
@@ -110,7 +110,7 @@ class Part:
     moved: bool = False
 
     @classmethod
-    def of(cls, fit: Fit, form: Form, moved: bool = False) -> Part:
+    def of(cls, fit: Fit, form: Form, moved: bool = False) -> "Part":
         """Return a part without functions, for records as `fit` goes through them."""
         span = free_forms.span_of(fit, free_forms.signals_along(fit))
         span = replace(span, orders=tuple(sorted({*span.orders, *FINE})))
@@ -139,16 +139,22 @@ class Part:
         each = (m.groups() for f in self.functions if self.moved for m in {m[0]: m for m in PLACE.finditer(f)}.values())
         return [(float(at), float(low), float(high), unit or self.place[0]) for at, low, high, unit in each]
 
-    def terms(self, places: Iterable[Any]) -> list[str]:
-        """The functions as source, with these names or values as their places, if they are `moved`."""
-        given, terms = iter(places), []
+    def placed(self, places: Iterable[Any]) -> list[str]:
+        """The functions with these names or values as their places, if they are `moved`, marked as places still."""
+        given, functions = iter(places), []
         for f in self.functions:
-            for m in {m[0]: m for m in PLACE.finditer(f)}.values():  # each once
-                f = f.replace(m[0], str(next(given)) if self.moved else m[1])
-            # Few functions are a law, which goes on, in a balance straight as R·i; of many nothing is known beyond.
-            on, law = CLIPPED.sub("z", f), self.moved and self.form.on in ("omega", "i", "v")
-            terms.append(on if law and (self.form.balance == "sensor" or "*" not in on) else f)
-        return terms
+            for old, value in {m[0]: m[1] for m in PLACE.finditer(f) if self.moved}.items():  # each once
+                f = f.replace(old, old.replace(value, str(next(given)), 1))
+            functions.append(f)
+        return functions
+
+    def terms(self, places: Iterable[Any]) -> list[str]:
+        """The same as source. Few functions are a law, which goes on, in a balance straight as R·i; of many nothing is
+        known beyond."""
+        terms = [PLACE.sub(r"\1", f) for f in self.placed(places)]
+        straight = [CLIPPED.sub("z", f) if self.moved and self.form.on in ("omega", "i", "v") else f for f in terms]
+        each = zip(terms, straight, strict=True)
+        return [on if self.form.balance == "sensor" or "*" not in on else f for f, on in each]
 
     def unit(self, fit: Fit, bare: bool = False) -> str:
         """Unit of the coefficients, or `bare` of what the part adds to its balance or its sensor, but for a carrier."""
@@ -182,8 +188,15 @@ class Part:
             rate = " * ca.fabs(m.omega)" if form.on == "path" else ""
             for k, (lag, kind, place) in enumerate(dict.fromkeys(MEMORY.findall(" ".join(terms)))):
                 past = f"lagged_{k}"
-                change = RATES[kind].format(s=past, p=place, step=step, sample=self.span.step) + rate
-                lines += [f"{past} = m.state('{own}_{past}'{FIRST.get(form.on, '')})", f"m.rate({past}, {change})"]
+                lines.append(f"{past} = m.state('{own}_{past}'{FIRST.get(form.on, '')})")
+                if kind in RATES:
+                    change = RATES[kind].format(s=past, p=place, step=step, sample=self.span.step) + rate
+                    lines.append(f"m.rate({past}, {change})")
+                else:
+                    (w, damped), sway = place.split(", "), f"{past}_rate"
+                    lines += [f"{sway} = m.state('{own}_{sway}')", f"m.rate({past}, {w} * {sway})",
+                              f"m.rate({sway}, {w} * (z - {past} - 2 * {damped} * {sway}))"]
+                    past = sway if kind == "sway" else past
                 terms = [t.replace(lag, past) for t in terms]
         lines += ["curve = (", *(f"    + {n} * {t}" for n, t in zip(names, terms, strict=True)), ")"]
         if form.carrier == "acceleration":
@@ -210,9 +223,9 @@ class Curve:
     values: tuple[float, ...] = ()  # of the coefficients, part by part
     fitted: Fit | None = None  # of the model with the curve
     name: str = "remainder"
-    begun: Curve | None = None  # the same as it grew in short windows, where it begins
+    begun: "Curve | None" = None  # the same as it grew in short windows, where it begins
     trial: bool = False  # in short windows, to see what is worth fitting to the records
-    first: Curve | None = None  # the same with its first functions only
+    first: "Curve | None" = None  # the same with its first functions only
 
     @property
     def effect(self) -> Effect:
@@ -275,15 +288,12 @@ class Curve:
         z, value = self.points
         forms, unit = _closed_forms(part.form.on, z), part.unit(self.fit)
         if part.form.on in PAST:
-            functions = free_forms.functions_of(part.form, part.span)
+            functions = [*part.placed(next(self._apart(self.values))[2]),
+                         *free_forms.functions_of(part.form, part.span)]
             lags = np.concatenate([free_forms.values_of(functions, part.form, s) for s in self._signals])
-            over = "rad" if part.form.on == "path" else "s"
-            base, also = ("a constant and ", [-1]) if part.form.carrier else ("", [])
-            powers = ("", "the square of ")[: 1 + part.form.bends]
-            each = product(powers, free_forms.memories_of(part.form, part.span))  # in the order of the functions
-            forms = [(f"{base}{power}one lag of {number(length, 2)} {over}", [lags[:, j] for j in (k, *also)])
-                     for k, (power, length) in enumerate(each)]
-            forms += [(words, [lags[:, k]]) for k, words in _followers(functions)]
+            base, also = ("a constant and ", [-1]) if part.form.carrier else ("", [])  # the last is a constant
+            known = _remembering(functions, part.place[0])
+            forms = [(base + words, [lags[:, j] for j in (k, *also)]) for k, words in known]
             unit = part.unit(self.fit, bare=True)
         return sorted((_closed(text, functions, value, unit) for text, functions in forms), key=lambda f: f[1])
 
@@ -304,7 +314,7 @@ class Curve:
     def _signals(self) -> list[dict[str, Array]]:
         return free_forms.signals_along(self.fit)
 
-    def grown(self) -> Curve | None:
+    def grown(self) -> "Curve | None":
         """Return the curve with functions of its last part that predict more, fitted, or None; raises as a fit."""
         last, (*before, part) = self.fitted or self.fit, self.parts
         if part.by_run and part.chosen:
@@ -328,13 +338,13 @@ class Curve:
                           for new in (free, [0.0] * len(more)))
         return curve.refitted(last, curve.sizes, without.sizes)
 
-    def without(self, k: int) -> Curve | None:
+    def without(self, k: int) -> "Curve | None":
         """Return the curve without a part, fitted anew; None where that fails."""
         kept = [[*sizes, *places] for j, (_, sizes, places) in enumerate(self._apart(self.values)) if j != k]
         curve = replace(self, parts=(*self.parts[:k], *self.parts[k + 1:]), values=tuple(chain.from_iterable(kept)))
         return curve.refitted(self.fitted or self.fit, curve.sizes)
 
-    def slimmed(self) -> Curve | None:
+    def slimmed(self) -> "Curve | None":
         """Return the curve without the functions that are within two deviations of nothing, fitted anew; None where
         there are none of these, or that fails."""
         parts, values, std = list[Part](), list[float](), self.fitted.std if self.fitted else {}
@@ -347,7 +357,7 @@ class Curve:
         slim = replace(self, parts=tuple(parts), values=tuple(values))
         return slim.refitted(self.fitted or self.fit, slim.sizes) if len(values) < len(self.values) else None
 
-    def refitted(self, last: Fit, *starts: Mapping[str, float]) -> Curve | None:
+    def refitted(self, last: Fit, *starts: Mapping[str, float]) -> "Curve | None":
         """Return the curve fitted with the model, from `starts` beside the `last` values or not; None if that fails, or
         only tells the measured angle to follow itself."""
         done = refit(last, self.fit.model + self.effect, [{**w, **s} for s in starts for w in (last.values, {})])
@@ -446,7 +456,7 @@ class Remainder:
                          "left out; do these hold voltages or speeds that others lack?")
 
     @cached_property
-    def _best(self) -> Grown | None:
+    def _best(self) -> "Grown | None":
         """The same, with what it predicts; None where none helps. Raises OutOfTime before there is any."""
         best = None
         with budget(SECONDS), looked_at():
@@ -456,7 +466,7 @@ class Remainder:
                 check_time()
         return best
 
-    def led_by_its_curve(self) -> Remainder:
+    def led_by_its_curve(self) -> "Remainder":
         """Return the same with the forms of its curve first, or none where no curve helps. Raises OutOfTime."""
         best = self._best
         zeros = best is not None and any(map(tells_the_zero, best.curve.fit.model.effects))  # another in every run
@@ -474,14 +484,14 @@ class Remainder:
         return {c: e.nrmse for c, e in best.predictions.held_out.items()} or dict(self.fitted.nrmse) if best else {}
 
     @property
-    def _grown(self) -> Grown | None:
+    def _grown(self) -> "Grown | None":
         """The same, as far as it has grown; None where none helps. Raises OutOfTime before there is any."""
         short = (t for root in [self._root or self.fit] for t in _grown_in(_moments(root), root, self.forms))
         every = _by_turns(*(islice(some, TRIED) for some in (self._tried(), short, *map(_beyond, self._anew))))
         return _predicting_most(self.fit, every, self._held or HeldOut.of(self.fit, None))
 
     @property
-    def _on_whole(self) -> Remainder | None:
+    def _on_whole(self) -> "Remainder | None":
         """The same on whole `_records`, where the fit is of parts: what was before each is not known there."""
         if not (runs := whole_of(self.fit, self._records)):
             return None
@@ -658,8 +668,7 @@ def _race(found: dict[Any, Grown], tried: Iterable[tuple[Curve, Form]], before: 
     """Put into `found` the curves, each with a form more: the first to its end, of the others those that get furthest
     with few functions (successive halving: Karnin, Koren & Somekh, ICML 2013), until one leaves nothing but noise.
 
-    Returns those that got furthest of all; none where one leaves nothing more. On `trial` all have few functions.
-    """
+    Returns those that got furthest of all; none where one leaves nothing more. On `trial` all have few functions."""
     racing = dict[Any, Iterator[Grown]]()
 
     def quiet(key: Any, functions: int) -> bool:
@@ -750,13 +759,14 @@ def _growing(curve: Curve, form: Form, moved: bool, before: Predictions, held: H
             yield Grown(gained, predicted, curve)
 
 
-def _followers(functions: Sequence[str]) -> Iterator[tuple[int, str]]:
-    """Yield the places of functions of what follows, but for lags, and what they are in words."""
+def _remembering(functions: Sequence[str], usual: str) -> Iterator[tuple[int, str]]:
+    """Yield which functions of what was before are a closed form, and that in words; `usual` is the unit of places."""
     for k, f in enumerate(functions):
-        if (m := MEMORY.search(f)) and m[2] != "past" and (at := PLACE.match(m[3])):
-            size, unit = float(at[1]), (at[4] or "s").partition(":")[0]
+        if (m := MEMORY.search(f)) and (at := PLACE.match(m[3])) and not f.startswith("ca.fmax"):
+            size, unit = float(at[1]), (at[4] or usual).partition(":")[0]
             slack = f"a slack of {number(2 / size, 2)} rad"  # turned over between a reversal and its end
-            yield k, FOLLOWS[m[2]].format(f"{number(size, 2)} {unit}") if "(z - " in f else slack
+            words = "what is ahead of " * ("(z - past" in f) + FOLLOWS[m[2]].format(f"{number(size, 2)} {unit}")
+            yield k, slack if unit == "1/rad" else "the square of " * ("ca.fabs(" in f) + words
 
 
 def _closed_forms(on: str, z: Array) -> list[tuple[str, Sequence[Array]]]:
@@ -773,8 +783,9 @@ def _closed_forms(on: str, z: Array) -> list[tuple[str, Sequence[Array]]]:
         return [(f"one wave, {k} to the turn", [np.sin(k * z), np.cos(k * z)]) for k in range(1, 13)]
     if on in ("theta", "t"):
         return [("a constant", [one]), ("a straight line", [one, z]), ("its square", [z**2]), ("its cube", [z**3])]
-    found = [("a constant", [one]), ("proportional to it", [z]), ("its sign alone", [side]),
-             ("its square, with its sign", [z * np.abs(z)]), ("its sign and proportional to it", [side, z])]
+    found = [("a constant", [one]), ("proportional to it", [z]), ("proportional to its size", [np.abs(z)]),
+             ("its sign alone", [side]), ("its square, with its sign", [z * np.abs(z)]),
+             ("its sign and proportional to it", [side, z])]
     if z.min(initial=0.0) < 0 < z.max(initial=0.0):
         found += [(f"a constant {way} zero", [s * z > 0]) for way, s in (("above", 1), ("below", -1))]
     if on == "omega":
