@@ -16,7 +16,7 @@ from motorid.diagnosis.candidates import Stages, library
 from motorid.diagnosis.experiment_design import suggest_experiment
 from motorid.diagnosis.free_forms import WHERE
 from motorid.diagnosis.locate import acting_like, locate
-from motorid.diagnosis.misspecification import DIFFERENCED, LIMITER, in_turn
+from motorid.diagnosis.misspecification import DIFFERENCED, LIMITER, better_forms, in_turn
 from motorid.diagnosis.model_comparison import far
 from motorid.diagnosis.record_versions import parts_remark
 from motorid.diagnosis.refit import with_lags_exchanged
@@ -183,13 +183,17 @@ def _left(found: Climb, named: bool, graded: bool, records: Sequence[Experiment]
     more = "fluctuation" if named or (remaining.adequate and not graded) else "structure"  # which an imitation hides
     kind = "structure" if not remaining.adequate else more if far(last) else "noise"
     approximating = {g.effect: g.form for g in found.grades if g.grade == "approximates"}
+    if kind == "noise" and graded and not named:  # beside what imitates it down to the noise nothing shows
+        kind, last, approximating = "structure", found.search.root.fit, {}
+        forms = in_turn(better_forms(last, last))
     left = Remainder(kind, last, forms, found.search.held, found.search.root.fit, approximating, records)
     if not (named or found.stopped) and left.proposed and seconds:
         found.search.stages.at("Growing a curve of what is left")
         try:
             with parallel.budget(seconds):
                 left = left.led_by_its_curve()
-            remaining = following(found.remaining, left.form.text) if left.form else found.remaining
+            if last is found.path[-1].fit:
+                remaining = following(found.remaining, left.form.text) if left.form else found.remaining
         except (OutOfTime, KeyboardInterrupt):
             parallel.interruption.heard()
     return remaining, left

@@ -4,8 +4,6 @@ After each addition the earlier effects are tried without, and with others in th
 (Coulomb where the friction grows with the load) can be overtaken.
 """
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -164,7 +162,7 @@ def _finished(found: Climb) -> Climb:
         found, structure = replace(found, remaining=within_noise(found.remaining)), False
     grades = grades_of(best, search.root, groups, forms, structure,
                        lambda name: None if found.stopped else search.without(best, name))
-    if not found.stopped and any(g.form for g in grades) and any(g.grade != "approximates" for g in grades):
+    if not found.stopped and any(map(_imitates, grades)) and any(g.grade != "approximates" for g in grades):
         grades = _sure_alone(search, best, grades)
     return replace(found, rounds=rounds, groups=groups, rivals=rivals, forms=tuple(forms), grades=grades)
 
@@ -205,17 +203,22 @@ def _sure_to_the_end(found: Climb) -> Climb:
     a law that the records do not show whole: a free parameter makes it fit what has another shape. Nor, beside what
     only approximates, one of which they show nothing: that is as likely to stand in for something else."""
     more = bool(far(fit := found.path[-1].fit)) or not found.remaining.adequate
-    half = any(g.grade == "approximates" and g.why != misspecification.DIFFERENCED for g in found.grades)
+    half = any(map(_imitates, found.grades))
     told = {e.name: run_through(fit, e) or (undetermined(fit, e, not more) if more or half else "")
             for e in fit.model.effects}
     return replace(found, grades=tuple(g if g.grade == "approximates" or not told[g.effect] else Grade(
         g.effect, "approximates", told[g.effect]) for g in found.grades))
 
 
+def _imitates(grade: Grade) -> bool:
+    """Tell whether an effect only stands in for something else, which may be in another's place, too."""
+    return grade.grade == "approximates" and grade.why != misspecification.DIFFERENCED
+
+
 def _sure_alone(search: Search, best: Node, grades: tuple[Grade, ...]) -> tuple[Grade, ...]:
-    """Return grades that hold without what only imitates a free form: that may be in a sure effect's place, too."""
+    """Return grades that hold without what only imitates something else: that may be in a sure effect's place, too."""
     core = best
-    for g in (g for g in grades if g.form):
+    for g in filter(_imitates, grades):
         core = search.without(core, g.effect) or core
     alone = grades_of(core, search.root, (), better_forms(core.fit, core.fit), True, partial(search.without, core))
     told = {g.effect: g for g in alone if g.form}
@@ -235,8 +238,7 @@ def _better(children: Collection[Node], best: Node) -> tuple[Node, list[Node]] |
 
     What physics speaks against is taken only where nothing else helps, held-out runs bear it out and it outdoes what it
     takes the place of: a friction that is less at rest is a dry one, rounded. Where the score is sure of nothing, a
-    plain fall of their error begins a ladder: at rest the density prefers what never moves.
-    """
+    plain fall of their error begins a ladder: at rest the density prefers what never moves."""
     better = [c for c in children if beats(c, best)]
     plain = [] if better else [c for c in children if evidence(best, c).plain]
     if plain and best.parent is None:
@@ -272,7 +274,7 @@ class Records:
     remarks: tuple[str, ...] = ()
     reading: versions.Reading | None = None  # the last one, of which the last remark tells
 
-    def read(self, reading: versions.Reading) -> Records:
+    def read(self, reading: versions.Reading) -> "Records":
         """Return all records read in another way."""
         after = reading.fitted(self.fit)
         held_out = self.held_out and [reading.of(r) for r in self.held_out]

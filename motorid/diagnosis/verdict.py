@@ -60,8 +60,7 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
                      remaining: Adequacy, curve: str = "", *, whole: bool = True, done: bool = True) -> str:
     """Return the answer when something is missing that the library does not have; `curve`: what it does as one.
 
-    Not `whole`: only some effects were asked for. Not `done`: the search was stopped before all of these were tried.
-    """
+    Not `whole`: only some effects were asked for. Not `done`: the search was stopped before all of these were tried."""
     none = "no effect of the library" if whole else "none of the effects asked for"
     lead = f"Unexplained: {like}, which {none} describes." if like else (
         "Something is missing, and these records do not show what." if grades and remaining.adequate else
@@ -71,8 +70,13 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
         lead += "" if grades else _promising({c.effect: c.predicted_drop for c in ranking})
     if grades:
         near, share, nearest = _nearest(rungs, grades, ranking)
-        lead, near = (f"Unexplained, but close to {near}; better still is {like}, which {none} describes.", "") if (
-            near and like and done and share > MOST) else (lead, near and f"Nearest: {near}.")
+        whole_share = share_removed(*(r.validation_nrmse or r.nrmse for r in (rungs[0], rungs[-1])))
+        if not near and whole_share > MOST and grades[1:]:
+            titles, share = listed([_titled(rungs[-1].fit, g.effect) for g in grades]), whole_share
+            near = f"{titles}, which together remove {percent(share, 2)} of the squared error"
+        better = f"; better still is {like}, which {none} describes" if like else ""
+        lead, near = (f"Unexplained, but close to {near}{better}.", "") if near and done and share > MOST else (
+            lead, near and f"Nearest: {near}.")
         helps = approximations_text([g for g in grades if g not in nearest or not g.why.startswith("it removes")])
         for form in (g.form for g in grades if g.form):  # in few words, and another may lead when fitted
             helps = helps.replace(IN_ITS_PLACE.format(form.text), "a free curve predicts better")
@@ -138,8 +142,7 @@ def approximations_text(grades: Sequence[Grade], what: str = "it") -> str:
 def missing_text(rungs: Sequence[Rung], remaining: Adequacy, groups: Sequence[Sequence[str]],
                  grades: Sequence[Grade], elsewhere: bool = False, stopped: str = "") -> str:
     """Return the answer when effects were found: what, how large, what the error becomes, what remains. `elsewhere`:
-    held-out runs are predicted far worse than the fitted ones. `stopped`: why before all were tried.
-    """
+    held-out runs are predicted far worse than the fitted ones. `stopped`: why before all were tried."""
     after = rungs[-1].fit
     names, (near, share, nearest) = [g.effect for g in grades if g.grade != "approximates"], _nearest(rungs, grades, ())
     first = [f"something close to {near}"] * (share > MOST and {g.grade for g in nearest} == {"approximates"})
@@ -161,9 +164,14 @@ def _left(last: Fit, remaining: Adequacy, where: str = "") -> str:
     return f"What remains is noise{where}. {fine_angle_remark(last)}".rstrip()
 
 
+def _titled(fit: Fit, name: str) -> str:
+    title = next(e for e in fit.problem.model.effects if e.name == name).title
+    return title if name in title else f"{title} [{name}]"
+
+
 def _described(fit: Fit, name: str) -> str:
     effect, std = next(e for e in fit.problem.model.effects if e.name == name), certain(fit)
-    said = [effect.title if name in effect.title else f"{effect.title} [{name}]"]
+    said = [_titled(fit, name)]
     for p in effect.parameters:
         now, sd = fit.problem.model.parameters[p.name], std.get(p.name)
         known = sd is not None or not now.vary

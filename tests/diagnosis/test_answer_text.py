@@ -129,6 +129,25 @@ def test_what_is_as_near_is_told_beside_the_nearest(rng):
     assert "as near" not in unexplained_text(ranking[:3], rungs, grades, "a torque", remaining)
 
 
+@pytest.mark.parametrize(("like", "better"), [
+    ("", "."), ("a torque", "; better still is a torque, which no effect of the library describes.")])
+def test_what_together_does_nearly_all_leads_though_each_is_open(rng, like, better):
+    """Of a robot that coasts two effects took an error of 14.5 to 1.9 %, and "no effect explains it" was said first."""
+    rubs = mi.dc_motor(R=2.0, L=2e-3, K=0.05, b=4e-5, J=3e-5) + mi.effects.coulomb(tau_c=5e-3)
+    rubs += mi.effects.speed_lag(T_w=3e-3)
+    t = np.arange(600) * 2e-3
+    fit = mi.fit(rubs, noisy(simulated(t, 6 * np.sign(np.sin(9 * t + 0.1)), model=rubs), rng))
+    rungs = [Rung(added, fit, {"omega": e}, None) for added, e in ((None, 0.1), ("coulomb", 0.06), ("speed_lag", 0.02))]
+    grades = [Grade("coulomb", "approximates", "a curve is better", SimpleNamespace(text="a torque")),
+              Grade("speed_lag", "approximates", "T_w is not determined, and the rest is not noise")]
+    remaining = SimpleNamespace(adequate=False, hum="", text="Something is missing.")
+    answer = unexplained_text((), rungs, grades, like, remaining)
+    names = "dry (Coulomb) friction [coulomb] and first-order lag of the speed measurement [speed_lag]"
+    assert answer.startswith(
+        f"Unexplained, but close to {names}, which together remove 96 % of the squared error{better}")
+    assert "together" not in unexplained_text((), [rungs[0], rungs[1]], grades[:1], like, remaining)
+
+
 def test_nearest_is_a_pair_by_what_both_removed_and_what_is_determined(rng):
     """What took an earlier effect's place removed what both do; sizes that are open are no headline beside known ones.
     (EV3: a speed filter for dry friction that differs by direction; a cart: a winding 90 +- 100 K colder for a limit.)

@@ -379,9 +379,11 @@ def test_a_load_of_less_than_a_thousandth_of_the_friction_beside_it_is_no_name(r
     assert not misspecification._within_smoothing(fit, mi.effects.coulomb)
 
 
+@pytest.mark.parametrize("curve", [True, False])
 @pytest.mark.parametrize(("alone", "kept"), [("the form is", False), ("it removes little", True), ("", True)])
-def test_what_stands_only_beside_imitators_of_a_free_form_is_not_named(monkeypatch, alone, kept):
-    """A tight spot of the turn: a ripple of the encoder took what told the friction beside it from a free curve."""
+def test_what_stands_only_beside_imitators_is_not_named(monkeypatch, alone, kept, curve):
+    """A tight spot of the turn: a ripple of the encoder took what told the friction beside it from a free curve. Of a
+    ramp that falls at once the friction and lag beside a current limit of open size were named."""
     form = Form("a friction", "torque", "turn", "direction")
     best, core = "coulomb + cogging + speed_ripple", "coulomb"
     nodes = {name: SimpleNamespace(fit=name) for name in (best, core)}
@@ -396,10 +398,25 @@ def test_what_stands_only_beside_imitators_of_a_free_form_is_not_named(monkeypat
     monkeypatch.setattr(stepwise, "better_forms", lambda *fits: list(fits))
     monkeypatch.setattr(stepwise, "grades_of", graded)
     beside = (Grade("coulomb", "group"), Grade("cogging", "approximates", "a curve", form),
-              Grade("speed_ripple", "approximates", "a curve", form))
+              Grade("speed_ripple", "approximates", *(("a curve", form) if curve else ("a_w is not determined",))))
     told = stepwise._sure_alone(SimpleNamespace(without=without, root=None), nodes[best], beside)
     assert told[1:] == beside[1:]
     assert told[0] == (beside[0] if kept else Grade("coulomb", "approximates", alone, form))
+
+
+def test_names_are_looked_at_without_what_imitates_but_for_half_a_sample(lab, monkeypatch):
+    """An elastic shaft that is damped as none is stands in for oil; a lag of half a sample for the mean over each."""
+    assert stepwise._imitates(Grade("compliance", "approximates", "zeta_r runs to 2"))
+    assert not stepwise._imitates(Grade("speed_lag", "approximates", misspecification.DIFFERENCED))
+    assert not stepwise._imitates(Grade("coulomb", "named"))
+    looked, alone = list[str](), stepwise._sure_alone
+    monkeypatch.setattr(stepwise, "_sure_alone", lambda *given: looked.append("alone") or alone(*given))
+    monkeypatch.setattr(stepwise, "grades_of", lambda *given: (
+        Grade("coulomb", "named"), Grade("speed_lag", "approximates", "T_w is not determined")))
+    runs = runs_of(lab, HIDDEN, n=300)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb",))
+    assert looked == ["alone"]
+    assert found.effects == ("coulomb",)
 
 
 def test_a_zero_of_the_encoder_is_no_surer_than_what_asks_for_it(lab):
