@@ -295,7 +295,8 @@ class Curve:
             known = _remembering(functions, part.place[0])
             forms = [(base + words, [lags[:, j] for j in (k, *also)]) for k, words in known]
             unit = part.unit(self.fit, bare=True)
-        return sorted((_closed(text, functions, value, unit) for text, functions in forms), key=lambda f: f[1])
+        on = np.concatenate([s.get(part.form.carrier, np.ones_like(s["t"])) for s in self._signals])
+        return sorted((_closed(text, each, value, on, unit) for text, each in forms), key=lambda f: f[1])
 
     @cached_property
     def points(self) -> tuple[Array, Array]:
@@ -794,11 +795,11 @@ def _closed_forms(on: str, z: Array) -> list[tuple[str, Sequence[Array]]]:
     return found
 
 
-def _closed(text: str, functions: Sequence[Array], value: Array, unit: str) -> tuple[str, float]:
-    """Return a closed form with its size, and the share of the curve that it misses."""
-    columns = np.column_stack(functions)
-    size = np.linalg.lstsq(columns, value, rcond=None)[0]
-    missed = value - columns @ size
-    share = float(np.sqrt(missed @ missed / max(float(value @ value), 1e-300)))
-    largest = float(np.abs(columns @ size).max(initial=0.0))
+def _closed(text: str, functions: Sequence[Array], value: Array, carrier: Array, unit: str) -> tuple[str, float]:
+    """Return a closed form with its size where the `carrier` is, and the share of what the curve does it misses."""
+    columns, does = np.column_stack(functions), value * carrier
+    size = np.linalg.lstsq(columns * carrier[:, None], does, rcond=None)[0]
+    missed = does - columns @ size * carrier
+    share = float(np.sqrt(missed @ missed / max(float(does @ does), 1e-300)))
+    largest = float(np.abs(columns @ size)[carrier != 0].max(initial=0.0))
     return f"{text}, at most {number(largest, 2)} {unit}".removesuffix(" 1"), share

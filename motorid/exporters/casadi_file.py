@@ -49,8 +49,7 @@ def system_of(found: Fit | Model) -> System:
 
 def values_of(found: Fit | Model, system: System) -> Array:
     """Return p (np,) in the order of the system."""
-    values = model_of(found).values
-    return np.array([values[n] for n in system.parameters])
+    return np.array([*map(model_of(found).values.__getitem__, system.parameters)])
 
 
 def description(found: Fit | Model) -> dict[str, Any]:

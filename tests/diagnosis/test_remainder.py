@@ -297,6 +297,15 @@ def test_the_nearest_closed_form_is_the_hidden_one(outside):
     assert shares == sorted(shares)
 
 
+def test_the_size_of_a_closed_form_is_that_where_its_carrier_is():
+    """A gain of the voltage is anything while there is none: a driver that waits was "at most 1500"."""
+    gain, v = np.array([-1.0, -1.0, 1500.0, 0.0, -1.0]), np.array([2.0, -3.0, 0.0, 0.0, 1.0])
+    text, missed = remainder._closed("one value", [np.ones(5)], gain, v, "1")
+    assert text == "one value, at most 1"
+    assert missed < 1e-9
+    assert remainder._closed("one value", [np.ones(5)], gain, np.ones(5), "V")[1] > 0.8
+
+
 def test_it_travels_to_another_process(outside):
     runs, found, _ = outside("eddy brake")
     model = found.remainder.model + found.remainder.as_effect()
