@@ -189,7 +189,7 @@ def _samples(runs: Sequence[Experiment]) -> int:
 CHANGING = 0.5  # of the samples at which the voltage must change for its reading to matter
 NOISY = -0.25  # correlation of successive changes: noise has -0.5, a smooth course +1
 WINDOWS = (5, 15, 45)  # samples of a running median
-# Samples by which the voltage may be late; then, beside the best, whole ones and parts of one.
+# Samples that the voltage may be late, or early by one (a row holds what it led to); then near the best, and parts.
 DELAYS = ((-1.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0), (-1.0, -0.5, 0.5, 1.0), (-0.25, 0.25), (-0.1, 0.1))
 NOISE = (0.9, 1.05)  # times what fast changes tell of the noise: errors that are all noise
 PLAIN, PROMISING = 0.1, 0.05  # fall of the error with another reading, and after a few steps with it
@@ -276,7 +276,7 @@ def _best_delay(fit: Fit, earlier: bool = False) -> list[Reading]:
     falls, best = {0.0: 0.0}, 0.0
     dt = float(np.median(np.concatenate([np.diff(r.t) for r in fit.problem.experiments])))
     for moves in DELAYS:
-        samples = [n for move in moves if (n := round(best + move, 6)) < 0 or not earlier]
+        samples = [n for move in moves if -1 <= (n := round(best + move, 6)) < (0 if earlier else np.inf)]
         falls |= {n: _fall(fit, delay_of(n * dt)) for n in samples if n not in falls}
         best = max(falls, key=lambda n: falls[n])
     return [delay_of(best * dt)] if falls[best] > PROMISING else []

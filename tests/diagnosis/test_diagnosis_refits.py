@@ -837,6 +837,14 @@ def test_what_stopped_far_from_the_noise_goes_on_as_a_whole_fit(monkeypatch):
     assert max(found.misfit.values()) < 1.5 < max(begun.misfit.values()) / 2, found.misfit
 
 
+@pytest.mark.parametrize("earlier", [True, False])
+def test_a_voltage_acts_no_more_than_a_sample_earlier(monkeypatch, earlier):
+    """A row may hold a command and what that led to; a housing that swings was "4.7 ms earlier" at 2 ms."""
+    fit = SimpleNamespace(problem=SimpleNamespace(experiments=[SimpleNamespace(t=0.002 * np.arange(9))]))
+    monkeypatch.setattr(parts, "_fall", lambda fit, reading: 0.5 - 10 * reading.delay)
+    assert [r.delay for r in parts._best_delay(fit, earlier)] == [-0.002]
+
+
 def test_a_voltage_that_acts_earlier_and_then_later_is_one_delay(lab, monkeypatch):
     """Of the same records "11.8 ms earlier" and "5.75 ms later" was said; with a third between them all stay."""
     rng = np.random.default_rng(3)
