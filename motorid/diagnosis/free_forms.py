@@ -67,7 +67,7 @@ PAST = (*(on for on in CHANGES if on.startswith("past ")), "path")
 MEMORIES = 8  # lengths of memory
 TRIPS = (0.02, 0.05, 0.1, 0.2, 0.4)  # of the largest heat: where a fuse or a derating sets in
 PLAY = (0.01, 0.4)  # of the largest value: half of the least and of the largest play
-DAMPED = 0.3  # share of the critical damping with which what swings begins
+DAMPED = 0.1  # share of the critical damping with which what swings begins
 LASTING = 10.0  # times the longest run: a memory that forgets nothing in it
 
 
@@ -290,12 +290,12 @@ def _sided(form: Form, lengths: Array, top: float) -> list[str]:
 def _swinging(form: Form, lengths: Array, finer: int) -> list[str]:
     """Return functions of what swings when pushed, a mass on a spring or an LC filter, and of its rate, as source."""
     z = form.on.removeprefix("past ")
-    if z not in ("v", "i", "omega") or form.channel == z:  # a sensor's own filter is of the library
-        return []
+    if finer == 1 or z not in ("v", "i", "omega") or form.channel == z:  # a sensor's own filter is of the library, and
+        return []  # forms compare better by few
     direct = (form.balance, z) == ("voltage", "v")  # no parameter of the motor makes that up
-    found, finer = [], min(finer, 3)
-    for w in 1 / np.geomspace(lengths[0] / 2, lengths[-1], finer * len(lengths)):
-        places = f"z, {_place(w, w / 10, 10 * w, 'rad/s')}, {_place(DAMPED / finer, 1e-3, 0.99, '1:damped')}"
+    found = []
+    for w in 1 / np.geomspace(lengths[0] / 2, lengths[-1], 3 * len(lengths)):
+        places = f"z, {_place(w, w / 10, 10 * w, 'rad/s')}, {_place(DAMPED, 1e-3, 0.99, '1:damped')}"
         found += [f"(z - swing({places}))" if direct else f"swing({places})", f"sway({places})"]
     return found
 
