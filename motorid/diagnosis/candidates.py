@@ -41,7 +41,7 @@ PAIRS = 3  # refitted where no single effect helps, and beside one that is refus
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
 ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast")  # their score at null says little
 OVER_TURN = next(f for f in FORMS if (f.balance, f.carrier, f.on) == ("torque", "direction", "turn"))
-MEETING = {"end_stop": ("spring",)}  # what they become where their places meet; a motor may have both
+SIMPLER = {"end_stop": ("spring",), "speed_filter": ("speed_average", "speed_delay")}  # near an effect
 FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have a limit
 
 
@@ -354,7 +354,7 @@ class Search:
 
     def _simpler(self, model: Model, effect: Effect) -> list[Model]:
         """Return the model with each simpler one of its kind in the place of an effect."""
-        simpler = {*effect.includes, *MEETING.get(effect.name, ())}
+        simpler = {*effect.includes, *SIMPLER.get(effect.name, ())}
         inside = [e for e in self.effects if e.name in simpler and e.name not in model.effect_names]
         return [m for e in inside if (m := _in_place(model, effect, e)) is not None]
 

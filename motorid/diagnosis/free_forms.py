@@ -293,11 +293,10 @@ def _swinging(form: Form, lengths: Array, finer: int) -> list[str]:
     if finer == 1 or z not in ("v", "i", "omega") or form.channel == z:  # a sensor's own filter is of the library, and
         return []  # forms compare better by few
     direct = (form.balance, z) == ("voltage", "v")  # no parameter of the motor makes that up
-    found = []
-    for w in 1 / np.geomspace(lengths[0] / 2, lengths[-1], 3 * len(lengths)):
-        places = f"z, {_place(w, w / 10, 10 * w, 'rad/s')}, {_place(DAMPED, 1e-3, 0.99, '1:damped')}"
-        found += [f"(z - swing({places}))" if direct else f"swing({places})", f"sway({places})"]
-    return found
+    rates = 1 / np.geomspace(lengths[0] / 2, lengths[-1], 3 * len(lengths))
+    damped = _place(DAMPED, 1e-3, 0.99, "1:damped")
+    places = [f"z, {_place(w, w / 10, 10 * w, 'rad/s')}, {damped}" for w in rates]
+    return [f for at in places for f in (f"(z - swing({at}))" if direct else f"swing({at})", f"sway({at})")]
 
 
 def _along(form: Form, span: Span, low: float, high: float) -> list[str]:

@@ -296,7 +296,8 @@ class Curve:
             forms = [(base + words, [lags[:, j] for j in (k, *also)]) for k, words in known]
             unit = part.unit(self.fit, bare=True)
         on = np.concatenate([s.get(part.form.carrier, np.ones_like(s["t"])) for s in self._signals])
-        return sorted((_closed(text, each, value, on, unit) for text, each in forms), key=lambda f: f[1])
+        forms.sort(key=lambda form: len(form[1]))  # of what misses as little, the simplest
+        return sorted((_closed(*form, value, on, unit) for form in forms), key=lambda f: round(f[1], 6))
 
     @cached_property
     def points(self) -> tuple[Array, Array]:

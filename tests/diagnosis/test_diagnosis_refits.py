@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.signal
 from battery.excite import driven, record
-from lab_records import noisy, simulated
+from lab_records import VALUES, noisy, simulated
 
 import motorid as mi
 from motorid.diagnosis import candidates as search
@@ -835,6 +835,19 @@ def test_what_stopped_far_from_the_noise_goes_on_as_a_whole_fit(monkeypatch):
     monkeypatch.setattr(search, "led_on", lambda fit: None)
     found = tried.brought_to_its_end(node).fit
     assert max(found.misfit.values()) < 1.5 < max(begun.misfit.values()) / 2, found.misfit
+
+
+def test_an_average_takes_the_place_of_a_filter_of_two_numbers_once_all_is_found(rng):
+    """The filter did better while a wrong scale of the current was missing, and stayed at twice the noise."""
+    t = np.arange(1200) * 2e-3
+    hidden = mi.dc_motor(**VALUES) + mi.effects.speed_average(T_a=0.026) + mi.effects.current_gain(k_i=0.15)
+    runs = [noisy(simulated(t, a * np.sign(np.sin(w * t + 0.1)) * (1 + 0.5 * (t > 1.2)), model=hidden), rng)
+            for a, w in ((6, 14), (4, 9), (5, 11))]
+    fit = mi.fit(mi.dc_motor(R=VALUES["R"]).fix(R=VALUES["R"]), runs[:2])
+    names = ("speed_average", "current_gain")
+    found = mi.diagnose(fit, runs[2:], effects=("speed_filter", "speed_lag", *names))
+    assert set(found.effects) == set(names)
+    assert found.after.values["T_a"] == pytest.approx(0.026, rel=0.01)
 
 
 @pytest.mark.parametrize("earlier", [True, False])

@@ -306,6 +306,18 @@ def test_the_size_of_a_closed_form_is_that_where_its_carrier_is():
     assert remainder._closed("one value", [np.ones(5)], gain, np.ones(5), "V")[1] > 0.8
 
 
+def test_of_closed_forms_that_miss_as_little_the_simplest_is_told(lab, monkeypatch):
+    """Of a tacho that shares its ground with the motor it was "its sign and proportional to it", of 16 digits alike."""
+    runs, _ = _with_law(shared_wire, ANGLE[:2], lab)
+    root = mi.fit(mi.dc_motor(), runs[:2])
+    (form,) = (f for f in free_forms.FORMS if f.text == "an error of the speed sensor that changes with the current")
+    left = Remainder("structure", root, (form,), HeldOut.of(root, None), root)
+    assert left.nearest()[0][0].startswith("proportional to it, at most")
+    digits = {"proportional to it": 2e-16, "its sign and proportional to it": 1e-16}
+    monkeypatch.setattr(remainder, "_closed", lambda text, *rest: (text, digits.get(text, 1.0)))
+    assert left.nearest()[0][0] == "proportional to it"
+
+
 def test_it_travels_to_another_process(outside):
     runs, found, _ = outside("eddy brake")
     model = found.remainder.model + found.remainder.as_effect()
@@ -525,6 +537,12 @@ def test_a_straight_law_goes_on_beyond_the_currents_that_were_seen(lab):
     left = Remainder("structure", root, (form,), HeldOut.of(root, None), root)
     after = mi.evaluate(left.fitted, runs[2]).nrmse
     assert max(after[c] / floor[c] for c in after) < 1.05
+
+
+@mi.effect(balance="sensor")
+def shared_wire(m, r=mi.P(4.0, "rad/s/A", null=0.0)):
+    """A tacho that shares its ground with the motor."""
+    m.measure("omega", m.measured("omega") + r * m.i)
 
 
 @mi.effect(balance="voltage")
