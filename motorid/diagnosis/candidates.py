@@ -41,7 +41,7 @@ PAIRS = 3  # refitted where no single effect helps, and beside one that is refus
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
 ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast")  # their score at null says little
 OVER_TURN = next(f for f in FORMS if (f.balance, f.carrier, f.on) == ("torque", "direction", "turn"))
-SIMPLER = {"end_stop": ("spring",), "speed_filter": ("speed_average", "speed_delay")}  # near an effect
+SIMPLER = {"end_stop": ("spring",), "speed_filter": ("speed_average",)}  # near an effect, and simpler
 FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have a limit
 
 

@@ -380,7 +380,7 @@ def memories_of(form: Form, span: Span) -> Array:
 
 
 def past(z: Array, along: Array, length: complex, initial: float) -> Array:
-    """Return `z` (N,) behind a first-order lag over `along` (N,), which grows: a time or a way."""
+    """Return `z` (N,) behind a first-order lag over `along` (N,), a time or a way; a complex `length` swings."""
     from scipy.signal import lfilter  # slow to import, and not needed before
 
     even = np.linspace(along[0], along[-1], len(along))
