@@ -318,8 +318,7 @@ def _looks(fit: Fit, held_out: Sequence[Experiment] | None, climbed: Callable[..
            left: Callable[[], float | None]) -> Iterator[tuple[Climb, Records]]:
     """Yield the climb and its records after every look that may be the last; each has the time that is `left`.
 
-    A misfit that something missing dominates may hide a better reading of the voltage; then it is climbed again.
-    """
+    A misfit that something missing dominates may hide a better reading of the voltage; then it is climbed again."""
     def look(at: Callable[..., Any], *given: Any) -> Any:
         with parallel.budget(left()):
             return at(*given)

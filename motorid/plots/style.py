@@ -110,8 +110,9 @@ def svg_of(draw: Callable[..., Any], *args: Any, name: str, alt: str, **options:
     inside, unique on the page; `alt` says what the figure shows."""
     with detached():
         figure = np.ravel(np.asarray(draw(*args, **options), object))[0].figure
-    if (engine := figure.get_layout_engine()) is not None:  # once, and not again while saving
-        engine.execute(figure)
+    if (engine := figure.get_layout_engine()) is not None:
+        for _ in range(2):  # in another size there may be other ticks; and not again while saving
+            engine.execute(figure)
         figure.set_layout_engine("none")
     buffer = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
