@@ -303,8 +303,11 @@ def test_there_are_few_layers():
     assert len(rooms) == len(set(rooms))
 
 
-def test_importing_motorid_loads_nothing_heavy(tmp_path):
-    code = f"import sys, motorid; print([m for m in {LATE!r} if m in sys.modules])"
+@pytest.mark.parametrize("work", ["", "mi.fit(mi.dc_motor(), mi.read_runs(mi.data_path('two_step_noisy')));"],
+                         ids=["import", "first fit"])
+def test_importing_motorid_and_a_first_fit_load_nothing_heavy(tmp_path, work):
+    late = [m for m in LATE if not work or m != "threadpoolctl"]
+    code = f"import sys, motorid as mi; {work} print([m for m in {late!r} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120,
                           check=True)
     assert done.stdout.strip() == "[]"

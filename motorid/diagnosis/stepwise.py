@@ -502,8 +502,7 @@ def ladder_of(found: Climb, validated: bool) -> Ladder:
                     {c: e.nrmse for c, e in node.predictions.held_out.items()} if validated else None,
                     tuple(sorted(before.key - node.key)), found.rounds[k] if k < len(found.rounds) else ())
         if k:
-            known = [grades[n] for n in names if n in grades]
-            worst = max(known, key=lambda g: ORDER.index(g.grade), default=None)
+            worst = max((grades[n] for n in names if n in grades), key=lambda g: ORDER.index(g.grade), default=None)
             gained = evidence(before, node)
             rung = replace(rung, grade=worst.grade if worst else "approximates", gain=gained.gain, gain_se=gained.se,
                            why=worded(worst.why, units) if worst else "a later effect took its place")

@@ -148,8 +148,7 @@ def driver_lag(m: Equations, T_v=P(5e-3, "s", null=0.0, positive=True, grid=(1.0
     Seen as current and speed that are both late: quick steps, both measured. T_v and L/R may change places in a fit:
     fix L where it is known.
     """
-    first = m.base("R") * m.start["i"] + m.base("K") * m.start["omega"]  # what holds the motor as it was
-    z = m.state("v_lagged", first)
+    z = m.state("v_lagged", m.base("R") * m.start["i"] + m.base("K") * m.start["omega"])  # holds it as it was
     m.rate(z, (m.v - z) / T_v)
     m.voltage -= m.v - z
 

@@ -214,8 +214,7 @@ def plot_waterfall(result: Multistart) -> np.ndarray:
 
 
 def _sorted_costs(ax: Axes, result: Multistart, ends: Sequence[tuple[StartResult, str]]) -> None:
-    lowest = min([result.reference.cost, *(e.cost for e, _ in ends)])
-    ratio = np.array([e.cost / lowest for e, _ in ends])
+    ratio = np.array([e.cost for e, _ in ends]) / min([result.reference.cost, *(e.cost for e, _ in ends)])
     for kind, (word, colour) in _KINDS.items():
         where = np.flatnonzero([k == kind for _, k in ends])
         if where.size:

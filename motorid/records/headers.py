@@ -254,8 +254,7 @@ def _channel_of(words: list[str]) -> tuple[str | None, float]:
         return "v", 1.5
     if len(channels) != 1 or (commanded and channels != {"v"}):
         return None, 0.0
-    known = {*hits, *_NEUTRAL, *_WEAK, *_DERIVATIVE, *_DUTY}
-    unknown = [w for w in words if w not in known and w not in _CHANNEL]
+    unknown = {*words} - {*hits, *_NEUTRAL, *_WEAK, *_DERIVATIVE, *_DUTY, *_CHANNEL}
     score = 2.0 if commanded or unknown else 3.0
     channel = channels.pop()
     return channel, 0.9 if max(map(len, hits)) == 1 and (unknown or channel == "t") else score

@@ -6,7 +6,8 @@
   JAX (where it is installed) and SciPy; the plain motor with two steps, and dry friction with reversals. Medians over
   repeats on fresh noise in which everybody takes a turn, compiled before: read the ratios. The others get a guess
   within a factor of two, the noise, the rest at the beginning and the width of sgn; motorid gets none of these.
-- ``first``: the first fit in a fresh process, with an empty and a filled cache of compiled steps.
+- ``first``: the first fit in a fresh process, with an empty and a filled cache of compiled steps. The package's own
+  files are compiled, as pip leaves them, whatever this environment says of that.
 - ``growth``: time and memory over samples, runs and channels; memory is the peak of a process of its own, with all that
   it imports.
 - ``effects``: a diagnosis over the number of effects tried.
@@ -105,14 +106,16 @@ def beside(repeat: int) -> None:
 def first(repeat: int) -> None:
     """Print the times of a fresh process."""
     print(f"{'A fresh process, s':<36}{'cold: processor':>16}{'wall':>8}{'warm: processor':>18}{'wall':>8}")
+    user = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     for name, code in FRESH.items():
         code = code.format(f"{mi.data_path('two_step_noisy')}/run*.csv")
+        subprocess.run([sys.executable, "-c", code], check=True, env=user)
         took = []
         for _ in range(max(repeat, 1)):
             with tempfile.TemporaryDirectory() as empty:
                 for _ in ("cold", "warm"):
                     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-                    subprocess.run([sys.executable, "-c", code], check=True, env={**os.environ, "MOTORID_CACHE": empty})
+                    subprocess.run([sys.executable, "-c", code], check=True, env={**user, "MOTORID_CACHE": empty})
                     wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
                     took += [after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime, wall]
         cold, cold_wall, warm, warm_wall = np.median(np.reshape(took, (-1, 4)), axis=0)

@@ -178,6 +178,21 @@ def test_every_dialect_gives_the_same_run(name, tmp_path):
         np.testing.assert_array_equal(run.outputs[channel], expected.outputs[channel])
 
 
+def test_a_table_of_numbers_alone_reads_as_one_with_other_cells(tmp_path, rng):
+    """Two parsers: NumPy's where every cell is a number, pandas where one is not."""
+    table = rng.standard_normal((40, 4)) * 10.0 ** rng.integers(-9, 9, (40, 4))
+    lines = [",".join([f"{0.001 * k:.3f}", *(f"{x:.{k % 15}e}" for x in row)]) for k, row in enumerate(table)]
+    plain, mixed = (read_csv(write(tmp_path, "\n".join(["t,v,i,omega,extra", *lines, last]), f"{last[:1]}.csv"))
+                    for last in ("0.04,1,2,3,4", "0.04,1,2,3,"))
+    assert plain.meta["extra"]["extra"][-1] == 4
+    assert np.isnan(mixed.meta["extra"]["extra"][-1])
+    for channel in ("v", "i", "omega"):
+        read = [{**run.inputs, **run.outputs}[channel] for run in (plain, mixed)]
+        np.testing.assert_allclose(*read, rtol=1e-15)
+        np.testing.assert_array_equal(read[0][:-1], [float(line.split(",")[1 + ("v", "i", "omega").index(channel)])
+                                                     for line in lines])
+
+
 def test_a_channel_that_is_left_out_need_not_be_told_from_others(tmp_path):
     path = write(tmp_path, "t,v,speed,current_2,current_3\n" + rows(pattern="{t:.3f},{v},{w:.3f},{i:.3f},{i:.3f}\n"))
     with pytest.raises(DataError, match="look equally like the current"):
