@@ -30,11 +30,13 @@ NUMBERS = {  # one plausible size of every effect
     "freewheel": {"c_g": 0.05, "b_free": 2e-6, "J_l": 2e-5, "side": 1.0},
     "speed_lag": {"T_w": 5e-3},
     "speed_filter": {"T_f": 5e-3, "zeta_f": 0.4},
+    "angle_lag": {"T_pos": 6e-3},
     "current_lag": {"T_i": 2e-3},
     "speed_delay": {"T_d": 8e-3},
     "current_offset": {"i_0": 0.03},
     "speed_gain": {"k_w": 0.05},
     "driver_coast": {"V_c": 12.0},
+    "driver_one_quadrant": {"V_c": 12.0},
     "pwm_coast": {"s_c": 0.8, "V_s": 3.0},
     "pwm_fast_decay": {"a_p": 1.5, "V_s": 3.0},
     "driver_current_limit": {"I_lim": 1.0},
@@ -98,8 +100,8 @@ def in_library_words(name, numbers, motor):
         n["r_slip" if name == "slip_clutch" else "r_free"] = J_l / J
     if name == "freewheel":
         n["g_free"] = n.pop("c_g") * (1 / motor.J + 1 / J_l)
-    if name == "driver_coast":  # so soon that it does not matter how
-        n = {"R_c": 100 * motor.R}
+    if name in ("driver_coast", "driver_one_quadrant"):  # so soon that it does not matter how
+        n = {"R_c" if name == "driver_coast" else "R_q": 100 * motor.R}
     if name == "lugre":
         theta_s = n["tau_c"] / n.pop("sigma_0")
         n |= {"s_b": n.pop("tau_s") / n["tau_c"], "theta_s": theta_s}

@@ -103,6 +103,12 @@ def driver_coast(m: Motor, V_c: float) -> Hooks:
 
 
 @_known
+def driver_one_quadrant(m: Motor, V_c: float) -> Hooks:
+    """Current flows along the command alone; against it, and at 0, diodes end it against V_c volts."""
+    return {"diodes": V_c, "one way": True}
+
+
+@_known
 def pwm_coast(m: Motor, s_c: float, V_s: float) -> Hooks:
     return {"drive": lambda v, w: v + s_c * max(1 - abs(v) / V_s, 0.0) * m.K * w}
 
@@ -319,6 +325,11 @@ def speed_filter(m: Motor, T_f: float, zeta_f: float) -> Hooks:
 @_known
 def current_lag(m: Motor, T_i: float) -> Hooks:
     return {"sensor": ("current_lag", T_i), "rate": 1 / T_i}
+
+
+@_known
+def angle_lag(m: Motor, T_pos: float) -> Hooks:
+    return {"sensor": ("angle_lag", T_pos), "rate": 1 / T_pos}
 
 
 @_known

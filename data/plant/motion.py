@@ -55,6 +55,7 @@ class Plant:
         self._s = (0 if omega0 == 0 else 1 if omega0 > 0 else -1) if self._level else FREE
         self._sensors = Chain(hooks, omega0)
         self._v, self._coasts = 0.0, any("diodes" in h for h in hooks)
+        self._one_way = any("one way" in h for h in hooks)
         self._limit = min((h["limit"] for h in hooks if "limit" in h), default=inf)
         self._lag = sum(h["lag"] for h in hooks if "lag" in h)
         self._slew = min((h["slew"] for h in hooks if "slew" in h), default=inf)
@@ -75,7 +76,17 @@ class Plant:
         self._v = v + n * slope
         for k in range(n):
             i, a, b = self._y[0], v + k * slope, v + (k + 1) * slope
-            self._advance(*(self._behind(a, b, h) if self._lag or self._slew < inf else (a, b)), h)
+            a, b = self._behind(a, b, h) if self._lag or self._slew < inf else (a, b)
+            before, moved = self._y, self._s
+            self._advance(a, b, h)
+            if self._one_way and i * self._y[0] < 0:  # to where the current ends, and on from there
+                low, part, high = 0.0, 0.5, 1.0
+                for _ in range(40):
+                    self._y, self._s, part = before, moved, 0.5 * (low + high)
+                    self._advance(a, a + part * (b - a), part * h)
+                    low, high = (part, high) if i * self._y[0] > 0 else (low, part)
+                self._y[0] = 0.0
+                self._advance(a + part * (b - a), b, (1 - part) * h)
             if self._coasts and v == 0 == slope and i * self._y[0] <= 0:
                 self._y[0] = 0.0  # the diodes let no current turn round
             if abs(i) <= self._limit < abs(self._y[0]):
@@ -174,6 +185,7 @@ def _physics(m: Motor, hooks: list[dict], omega0: float, theta0: float) -> tuple
     drives, drops, torques, dries, heats = (every(k) for k in ("drive", "drop", "torque", "dry", "heat"))
     f_R, f_L, f_K, f_Kt, f_Ke, bridges = (every(k) for k in ("R", "L", "K", "Kt", "Ke", "bridge"))
     diodes, limit = every("diodes"), min(every("limit"), default=None)
+    one_way = bool(every("one way"))
     parts, fluxes, x0 = [], [], []
     for h in hooks:
         if "part" in h:
@@ -196,6 +208,9 @@ def _physics(m: Motor, hooks: list[dict], omega0: float, theta0: float) -> tuple
         i, w, th, dT = y[0], y[1], y[2], y[3]
         R, L, K, Kt, Ke = R0, L0, K0, 1.0, 1.0
         opened = diodes and v == 0
+        if one_way and v:
+            along = 1 if v > 0 else -1
+            opened = i * along < 0 or (i == 0 and (v - K0 * w) * along <= 0)
         if shaped:
             for f in drives:
                 v = f(v, w)

@@ -76,7 +76,8 @@ class Chain:
 
     def __init__(self, hooks: list[dict], omega0: float) -> None:
         has = dict(h["sensor"] for h in hooks if "sensor" in h)
-        self.lag_i, self.lag_w = has.get("current_lag"), has.get("speed_lag")
+        self.lag_i, self.lag_w, self.lag_th = (has.get(f"{c}_lag") for c in ("current", "speed", "angle"))
+        self._behind = float(omega0)  # the speed behind the angle's lag; that times the lag the angle is late
         self.filter, self._rate = has.get("speed_filter"), 0.0
         self.delay, self.gain = has.get("speed_delay", 0.0), has.get("speed_gain", 1.0)
         self.offset, self.window = has.get("current_offset", 0.0), has.get("speed_average", 0.0)
@@ -85,7 +86,7 @@ class Chain:
         self.duty = has.get("duty", lambda v: 1.0)
         self.i, self.w = 0.0, float(omega0)
         self._last = (0.0, float(omega0))
-        self._at_once = not (self.lag_i or self.lag_w or self.filter or self.delay or self.window)
+        self._at_once = not (self.lag_i or self.lag_w or self.lag_th or self.filter or self.delay or self.window)
         self._turned, self._omega0 = 0.0, float(omega0)  # the integral of the speed
         self._times, self._speeds = [0.0], [0.0 if self.window else float(omega0)]
 
@@ -95,6 +96,7 @@ class Chain:
             self.i, self.w = i, w
             return
         self.i = _lag(self.i, self._last[0], i, h, self.lag_i)
+        self._behind = _lag(self._behind, self._last[1], w, h, self.lag_th)
         if self.filter:
             self.w, self._rate = _filtered(self.w, self._rate, self._last[1], w, h, *self.filter)
         else:
@@ -116,7 +118,7 @@ class Chain:
         i = self.current_gain * self.duty(v) * self.i + self.offset
         part, periods, phase, angle = self.ripple
         w *= 1 + part * sin(periods * y[2] + phase)
-        theta = y[2] - angle * part / periods * cos(periods * y[2] + phase)
+        theta = y[2] - angle * part / periods * cos(periods * y[2] + phase) - (self.lag_th or 0.0) * self._behind
         return {"i": i, "omega": self.gain * w + self.speed_offset, "theta": theta}
 
     def _delayed(self, t: float) -> float:

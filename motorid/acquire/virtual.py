@@ -4,8 +4,6 @@
 are those of the plant, which shares no code with the models.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable
@@ -32,7 +30,7 @@ class VirtualDevice:
     """A device that answers commands and makes samples of `channels`, ``v`` first, `rate` times a second. Its counters
     begin at `counter0` and `time0`; in every run the shaft of the motor `truth` begins at rest at angle zero."""
 
-    def __init__(self, truth: Truth, rate: float = 1000.0,
+    def __init__(self, truth: "Truth", rate: float = 1000.0,
                  channels: tuple[str, ...] = ("v", *CHANNELS), counter_bits: int = 32,
                  timer_bits: int = 32, counter0: int = 0, time0: int = 0, encoder_bits: int = 32) -> None:
         self.truth, m = truth, truth.motor

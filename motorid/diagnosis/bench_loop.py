@@ -1,7 +1,5 @@
 """Closing the loop with a bench: record, fit, diagnose, design the next record, record again."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ noise is what a record would add to the evidence between them (Hunter & Reiner, 
 `design_experiment` starts there and optimises the voltage; see `motorid.diagnosis.design_criteria`.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -370,9 +370,8 @@ class Curve:
     @property
     def law(self) -> str:
         """The law as source."""
-        each = enumerate(self._apart(self.sizes))
         return "\n".join(part.law(sizes, places, [before.form.on for before in self.parts[:k]])
-                         for k, (part, sizes, places) in each)
+                         for k, (part, sizes, places) in enumerate(self._apart(self.sizes)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -696,8 +695,7 @@ def alone_predicting_more(last: Node, root: Fit, held: HeldOut, forms: Sequence[
     found = dict[Any, Grown]()
     check_time()
     with contextlib.suppress(*FAILURES):
-        tried = islice(_grown_in(_moments(root), root, forms), AHEAD)
-        _race(found, tried, held.predictions(root), held, True)
+        _race(found, islice(_grown_in(_moments(root), root, forms), AHEAD), held.predictions(root), held, True)
     gains = (FormGain(key[1], compare(last.predictions, f.predictions), f.predictions) for key, f in found.items())
     return next((gain for gain in gains if gain.evidence.worth_it), None)
 

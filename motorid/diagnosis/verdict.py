@@ -206,11 +206,14 @@ def errors_text(rungs: Sequence[Rung]) -> str:
     return text
 
 
-def curve_text(rungs: Sequence[Rung], errors: Mapping[str, float]) -> str:
-    """Say what the `errors` become with what is left as a curve; empty where none is known."""
+def curve_text(rungs: Sequence[Rung], errors: Mapping[str, float], forms: Sequence[tuple[str, float]]) -> str:
+    """Say what the `errors` become with what is left as a curve, and which of the closed `forms`, the nearest first, it
+    is but for a trifle; empty where none is known."""
     was = moving(rungs[0].validation_nrmse or rungs[0].nrmse)
     said = ", ".join(_changed(c, e, errors[c]) for c, e in was.items() if c in errors)
-    return f"With that as a curve{' on held-out runs' * bool(rungs[0].validation_nrmse)}: {said}." if said else ""
+    near = "".join(f" The nearest closed form, {text}, misses {'less than ' * (miss < 1e-3)}"
+                   f"{percent(max(miss, 1e-3), 2)} of it." for text, miss in forms[:1] if miss < TRIFLE)
+    return f"With that as a curve{' on held-out runs' * bool(rungs[0].validation_nrmse)}: {said}.{near}" if said else ""
 
 
 def rises_text(rungs: Sequence[Rung]) -> str:

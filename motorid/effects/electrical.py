@@ -92,6 +92,18 @@ def driver_coast(m: Equations, R_c=P(50.0, "Ω", null=0.0, positive=True, grid=(
 
 
 @effect(balance="voltage")
+def driver_one_quadrant(m: Equations, R_q=P(50.0, "Ω", null=0.0, positive=True, grid=(3.0, 30.0),
+                                            doc="resistance against a current that the drive does not carry")):
+    """One-quadrant drive: no current but along the command. Mohan et al., Power Electronics, 2003, ch. 7.
+
+    One switch and a diode, a supply that takes nothing back: a motor whose back-EMF is larger runs free. Seen where
+    steps down are far slower than steps up.
+    """
+    against = ca.if_else(m.command > OPEN, ca.fmin(m.i, 0), ca.if_else(m.command < -OPEN, ca.fmax(m.i, 0), m.i))
+    m.voltage -= R_q * against
+
+
+@effect(balance="voltage")
 def pwm_coast(m: Equations, s_c=P(0.5, "", null=0.0, lower=0.0, upper=1.5, doc="share of the pauses without current"),
               V_s=SUPPLY):
     """PWM whose bridge opens in its pauses: no back-EMF acts there, K·ω·(1−s·(1−d)), d = abs(v)/V_s. Mohan, 2012.

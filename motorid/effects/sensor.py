@@ -88,6 +88,14 @@ def speed_ripple(m: Equations, a_w=P(0.02, "", null=0.0, lower=0.0, upper=0.3, d
 
 
 @effect(balance="sensor")
+def angle_lag(m: Equations, T_pos=P(5e-3, "s", null=0.0, positive=True, grid=(1.0, 4.0, 16.0), pole=True,
+                                    doc="time constant of the angle filter")):
+    """First-order lag of the angle sensor, as of a magnetic encoder. Åström & Murray, Feedback Systems, 2008."""
+    _filter(m, "theta", "lagged", T_pos, (1,))
+    m.initial["theta"] += T_pos * m.start["omega"]
+
+
+@effect(balance="sensor")
 def current_lag(m: Equations, T_i=P(1e-3, "s", null=0.0, positive=True, grid=(0.5, 2.0, 8.0), pole=True,
                                     doc="time constant of current filter")):
     """First-order lag of the current measurement. Åström & Murray, Feedback Systems, 2008."""

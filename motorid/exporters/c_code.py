@@ -75,7 +75,8 @@ def _error(functions: Mapping[str, ca.Function], record: Mapping[str, Any], m: i
     """Return the largest difference of an output between `m` sub-steps and those of the record, over its span."""
     n = max(min(len(record["t"]), MOST_STEPS // m), 2)
     t, u, fine = np.array(record["t"][:n]), np.array(record["u"])[:, :n], np.array(record["substeps"][:n - 1])
-    y, told = (np.array(casadi_file.simulation("walk", functions, t, k, record["held"])(record["s"], u, record["p"])[0])
+    way = np.tile(1.0 - np.array(record["held"], float), (n - 1, 1))
+    y, told = (np.array(casadi_file.simulation("walk", functions, t, k, way)(record["s"], u, record["p"])[0])
                for k in (np.full(n - 1, m), fine))
     error = float((np.abs(y - told).max(axis=1) / np.maximum(np.ptp(told, axis=1), 1e-300)).max())
     return error if np.isfinite(error) else np.inf

@@ -18,7 +18,7 @@ from motorid.exporters.json_file import fit_dict
 from motorid.integrate.rodas3 import StepFunctions
 from motorid.model.equations import System
 from motorid.model.model import SHOWN, Model
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, going_on
 from motorid.problem.plain_data import model_dict
 from motorid.problem.problem import Problem
 from motorid.problem.runs import Run, zoh_inputs
@@ -176,7 +176,7 @@ def _simulations(functions: Mapping[str, ca.Function], records: Sequence[Mapping
             raise ValueError(f"record {k}")
         p = ca.DM(r["p"]) if "p" in r else functions["parameters"]()["p"]
         found += [ca.Function(f"record_{k}", [], [ca.DM(t).T, ca.DM(r["s"]), ca.DM(u), p], [], ["t", "s", "u", "p"]),
-                  simulation(f"simulate_{k}", functions, t, m, r["held"])]
+                  simulation(f"simulate_{k}", functions, t, m, np.where(r["held"], going_on(t, u.T), 1.0))]
     return found
 
 
@@ -191,8 +191,9 @@ def runs_of(problem: Problem, q: Array) -> list[tuple[Run, Array, Array]]:
 
 
 def simulation(name: str, functions: Mapping[str, ca.Function], t: Array, m: NDArray[np.int64],
-                held: Sequence[bool]) -> ca.Function:
-    """Return ``(s, u, p) -> (y, x)`` on the samples t (N,) and sub-steps m (N-1,): s (3,), u (nu, N), y (ny, N)."""
+                way: Array) -> ca.Function:
+    """Return ``(s, u, p) -> (y, x)`` on the samples t (N,) and sub-steps m (N-1,): s (3,), u (nu, N), y (ny, N). Inputs
+    do so much of a change by the `way` (N-1, nu): none while they are held, all between linear ones."""
     initial, outputs, step = (functions[n] for n in ("initial", "outputs", "step"))
     nu, np_ = step.size1_in(1), step.size1_in(4)
     interval = np.repeat(np.arange(len(m)), m)
@@ -201,7 +202,7 @@ def simulation(name: str, functions: Mapping[str, ca.Function], t: Array, m: NDA
     share = 1.0 / m[interval]
     s, u, p = ca.MX.sym("s", 3), ca.MX.sym("u", nu, len(t)), ca.MX.sym("p", np_)
     before = u[:, interval.tolist()]
-    slope = ca.vertcat(*[u[j, (interval if hold else interval + 1).tolist()] for j, hold in enumerate(held)]) - before
+    slope = (u[:, (interval + 1).tolist()] - before) * ca.DM(way[interval].T)
     u0 = before + slope * ca.repmat(ca.DM(part * share).T, nu, 1)
     u1 = u0 + slope * ca.repmat(ca.DM(share).T, nu, 1)
     h = ca.DM(np.diff(t)[interval] * share).T

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motorid.model.equations import System
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, going_on
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,10 +24,11 @@ class Grid:
 
     @staticmethod
     def of(t: Array, u: Array, held: NDArray[np.bool_]) -> "Grid":
-        """Lay out inputs `u` (N, nu); `held` (nu,) tells which stay constant between samples."""
+        """Lay out inputs `u` (N, nu); `held` (nu,) tells which stay constant between samples, if none is left out."""
         u = np.ascontiguousarray(u, float)
-        return Grid(np.ascontiguousarray(t, float), u, np.ascontiguousarray(u[:-1]),
-                    np.ascontiguousarray(np.where(held, u[:-1], u[1:])), np.ones(len(t) - 1, np.int64))
+        ends = np.where(held, u[:-1] + going_on(t, u) * np.diff(u, axis=0), u[1:])
+        return Grid(np.ascontiguousarray(t, float), u, np.ascontiguousarray(u[:-1]), np.ascontiguousarray(ends),
+                    np.ones(len(t) - 1, np.int64))
 
     @cached_property
     def dt(self) -> Array:

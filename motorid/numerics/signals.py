@@ -18,6 +18,7 @@ HELD = 30.0  # times the noise that its changes are, squared: 130 and more in a 
 _EVEN = 1e-6  # of the interval: samples are evenly spaced if their times wander by less
 _FEW, _MOSTLY = 512, 0.8  # jumps of a first look at a step, and the share of them that must be its multiples
 _REST = 12  # equal samples in a row that count as standstill
+MOST_LEFT_OUT = 3  # samples in a row: what an input did in more nobody knows
 CLIP = 6.0  # robust standard deviations beyond which a residual counts as an outlier
 _DITHERED = 0.6  # noise that is to be seen through the steps leaves fewer neighbours equal than this
 
@@ -91,6 +92,19 @@ def quantum(y: ArrayLike) -> float:
         if np.mean((np.abs(steps - steps.round()) < 0.1) & ((steps > 0.5) | (jumps < rounded))) > 0.95:
             return step  # beside a few glitches, too, all else is far less than one, and yet no rounding
     return 0.0
+
+
+def going_on(t: Array, u: Array) -> Array:
+    """Return which share of its change from one sample to the next what is held between samples, `u` (N, ...), does by
+    the way, (N-1, ...): where a few samples were left out, and it changed as evenly across them as beside."""
+    dt = np.diff(t)
+    steps = (dt / (np.median(dt) if len(dt) else 1.0)).reshape(-1, *[1] * (u.ndim - 1))
+    rates = np.pad(np.diff(u, axis=0) / steps, [(1, 1), *[(0, 0)] * (u.ndim - 1)])
+    before, across, after = rates[:-2], rates[1:-1], rates[2:]
+    slack = np.maximum(np.abs(before), np.abs(after)) / 2
+    even = (across >= np.minimum(before, after) - slack) & (across <= np.maximum(before, after) + slack)
+    few = (steps > 1.5) & (steps < MOST_LEFT_OUT + 1.5) & (np.abs(steps - steps.round()) < 0.1)
+    return np.where(few & even, 1 - 1 / steps, 0.0)
 
 
 def repeats(y: Array) -> NDArray[np.bool_]:

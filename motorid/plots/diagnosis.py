@@ -1,7 +1,5 @@
 """Figures of a diagnosis: where the model fails, which effect is missing, how the error falls."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -114,8 +112,7 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     """
     style.refuse_other(found, Diagnosis, "plot_answer takes a diagnosis, mi.diagnose(fit)")
     m = found.missing
-    apart = any(np.any(v) for v in m.voltage)  # else the torque stands for both
-    balance = "voltage" if found.where == "electrical" and apart else "torque"
+    balance = "voltage" if found.where == "electrical" and any(map(np.any, m.voltage)) else "torque"  # if not apart
     had = accounted(found.before, found.after)[balance == "torque"] if found.after is not found.before else None
     against, periods = _quantity(found, balance, had)
     x = np.concatenate([np.asarray(s[against]) * periods for s in m.signals])

@@ -1,7 +1,5 @@
 """Figures of records, of a fit and its limits, and of how parameters moved from fit to fit."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple

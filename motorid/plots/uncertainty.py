@@ -1,7 +1,5 @@
 """Figures of how far to trust a fit: singular values, profiles and intervals, sensitivities, multistart."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping, Sequence
 

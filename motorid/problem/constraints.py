@@ -4,8 +4,6 @@ As a *penalty* its rows add to the least-squares residual (`Relation.evaluate`);
 `MultipleShooting` they stay between limits (`Relation.parts`).
 """
 
-from __future__ import annotations
-
 import warnings
 import weakref
 from abc import ABC, abstractmethod

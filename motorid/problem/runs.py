@@ -117,7 +117,6 @@ def _level(run: Experiment, channel: str) -> float:
     return known[channel]
 
 
-# -- the state at the first sample -----------------------------------------------------------------------
 def initial_state(run: Experiment, sigma: Mapping[str, float],
                   initial: str) -> tuple[Array, dict[str, tuple[float, float]]]:
     """Return i, omega, theta (3,) at the first sample, and between which limits some of them are to be estimated.
@@ -258,7 +257,6 @@ def _first_speed(theta: Array, t: Array, sigma: float) -> tuple[float, float]:
     return float(pair[0] - gained / 2), float(REACH * noise + abs(gained))
 
 
-# -- natural sizes ---------------------------------------------------------------------------------------
 def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> dict[str, float]:
     """Return the natural size of each unit in these records: torque is that at the highest current, time the sample
     time, heat what the winding loses in the longest run for 30 K; ``lowest``, ``highest``: ends of the angle."""
@@ -352,7 +350,6 @@ def _sizes_of(run: Experiment) -> _Sizes:
     return _sizes[run]
 
 
-# -- the width of sgn ------------------------------------------------------------------------------------
 def first_width(runs: tuple[Experiment, ...], parameters: Mapping[str, Parameter]) -> float | None:
     """Return the width of sgn to begin with, None if given or unused; the voltage narrows it where no speed does."""
     if (p := parameters.get("sgn_width")) is None or p.given:

@@ -1,7 +1,5 @@
 """Sensitivities in units that people compare, and `check_derivatives`: the exact Jacobian beside finite differences."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -40,7 +38,7 @@ class DerivativeCheck:
         """Whether all derivatives agree within the tolerance."""
         return self.worst <= self.tolerance
 
-    def table(self) -> DataFrame:
+    def table(self) -> "DataFrame":
         """Return the relative differences as a table, unknowns down and channels across."""
         from pandas import DataFrame
 

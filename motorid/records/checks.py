@@ -1,7 +1,5 @@
 """Are units, signs and columns right, and will these runs show what a fit has to know? See `check_runs`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from itertools import pairwise, permutations, product
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from motorid.display.numbers import counted
 from motorid.errors import DataError, otherwise
-from motorid.numerics.signals import Array, fresh_means, repeats
+from motorid.numerics.signals import Array, fresh_means, going_on, repeats
 from motorid.records.experiment import INPUTS, MIN_SAMPLES, PARTS, Experiment, pauses
 from motorid.records.layout import Layout, Place
 from motorid.records.preprocessing import unwrapped
@@ -38,7 +38,7 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
     values = {c: a[rows] for c, a in values.items()}
     empty = [c for c, a in values.items() if np.isnan(a).all()]
     said += [f"left out '{places[c].column}' ({c}): every sample is missing." for c in empty]
-    inputs = {c: _filled_forward(values[c], places[c].column, said) for c in INPUTS if c in values and c not in empty}
+    inputs = {c: _filled(t, values[c], places[c].column, said) for c in INPUTS if c in values and c not in empty}
     outputs = {c: a for c, a in values.items() if c not in (*INPUTS, *empty)}
     said += [f"'{places[c].column}' ({c}) is missing in {np.count_nonzero(np.isnan(a))} of {len(a)} rows."
              for c, a in outputs.items() if np.isnan(a).any()]
@@ -220,14 +220,16 @@ def _first_input(v: Array, column: str, said: list[str]) -> int:
     return int(known[0])
 
 
-def _filled_forward(v: Array, column: str, said: list[str]) -> Array:
+def _filled(t: Array, v: Array, column: str, said: list[str]) -> Array:
     missing = ~np.isfinite(v)
     if not missing.any():
         return v
     said.append(f"the input '{column}' is missing in {np.count_nonzero(missing)} of {len(v)} rows; "
-                "it was held from the last known value.")
+                "it was held from the last known value, or goes on evenly where a few are missing from what does.")
     first = int(np.argmin(missing))  # before it only what is measured beside the voltage may be missing
-    return v[np.maximum.accumulate(np.where(missing, first, np.arange(len(v))))]
+    known, last = np.flatnonzero(~missing), np.maximum.accumulate(np.where(missing, first, np.arange(len(v))))
+    even = np.append(going_on(t[known], v[known]) > 0, False)[np.searchsorted(known, last)]
+    return np.where(even, np.interp(t, t[known], v[known]), v[last])
 
 
 def _note_gaps(t: Array, said: list[str]) -> None:

@@ -1,7 +1,5 @@
 """Where the shipped records are, what is hidden in them, and the plant they come from."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import sys

@@ -1,7 +1,5 @@
 """The explorer of a model in a notebook: tick effects, move parameters, see curves and errors change, refit."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from html import escape
@@ -26,7 +24,7 @@ TITLES = {"voltage": "Voltage balance", "torque": "Torque balance", "transmissio
 REACH = 10.0  # a slider goes from a tenth to ten times the value it begins with
 
 
-def explore(fit: Fit, *, effects: Iterable[Effect | str] | None = None) -> Explorer:
+def explore(fit: Fit, *, effects: Iterable[Effect | str] | None = None) -> "Explorer":
     """Play with a fit in a notebook: tick effects, move parameters, see the curves and the error, refit.
 
     Effects stand by balance, the most promising first, with the share of the misfit that each is predicted to remove.

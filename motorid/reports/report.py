@@ -1,7 +1,5 @@
 """One self-contained page that tells the story of a result: `report`; its sections with text, figures and tables."""
 
-from __future__ import annotations
-
 import platform
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -78,7 +76,7 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
     return write_files({Path(path): printable(page)}, force)[0]
 
 
-def _provenance(story: Story, command: str, held_out: Sequence[Experiment]) -> Section:
+def _provenance(story: "Story", command: str, held_out: Sequence[Experiment]) -> "Section":
     files = [[run.name + more, Path(str(run.meta.get("source", "–"))).name, str(run.meta.get("sha256", "–"))[:16]]
              for more, runs in (("", story.runs), (" (held out)", held_out)) for run in runs]
     versions = ", ".join([f"Python {platform.python_version()}", *(f"{p} {package_version(p)}" for p in PACKAGES)])
@@ -95,7 +93,7 @@ class Story:
     lead: str = ""
     flags: Sequence[Flag] = ()
     facts: Sequence[tuple[str, str]] = ()
-    sections: list[Section] = field(default_factory=list)
+    sections: "list[Section]" = field(default_factory=list)
     runs: Sequence[Experiment] = ()
 
 

@@ -3,8 +3,6 @@
 Efron & Tibshirani, An Introduction to the Bootstrap, 1993; blocks: Künsch, Annals of Statistics 17, 1989.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """How certain are the values? Covariance, correlations and intervals, for coloured residuals too."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property

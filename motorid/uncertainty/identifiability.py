@@ -6,8 +6,6 @@ singular values are the signal-to-noise ratios of such steps (Golub & Van Loan, 
 identifiability of nonlinear ODE models", SIAM Review 53, 2011). It works on planned experiments too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass

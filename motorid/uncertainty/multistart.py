@@ -1,7 +1,5 @@
 """Fits from many random starts, the study of the source paper: do they all lead to the same place?"""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +28,7 @@ PLACES, FARTHEST = 2, 3  # places told of those where other fits ended, and para
 
 @one_thread
 def multistart(problem_or_fit: Problem | Fit, *, starts: int = 100, spread: float = 10.0, seed: int = 0,
-               guess: bool = False, solver: Any = None, map: Map | None = None, quiet: bool = False) -> Multistart:
+               guess: bool = False, solver: Any = None, map: Map | None = None, quiet: bool = False) -> "Multistart":
     """Fit from many random starts and count how many reach the best fit.
 
     Parameters
@@ -84,7 +82,7 @@ def _draw(reference: Fit, names: Sequence[str], starts: int, spread: float, seed
     return [dict(zip(names, row, strict=True)) for row in drawn.tolist()]
 
 
-def _from_start(task: tuple[Problem, dict[str, float], Any, bool], start: dict[str, float]) -> StartResult | Failure:
+def _from_start(task: tuple[Problem, dict[str, float], Any, bool], start: dict[str, float]) -> "StartResult | Failure":
     (problem, values, solver, guess), began = task, time.perf_counter()
     here = problem.for_model(problem.model.start_at(values | start))
     try:

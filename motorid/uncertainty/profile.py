@@ -5,8 +5,6 @@ limit it on that side (Raue et al., Bioinformatics 25, 2009). The rise of the co
 coloured residuals enlarge the parameter's variance (Kent, Biometrika 69, 1982). `intervals`: beside other methods.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

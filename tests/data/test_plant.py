@@ -54,8 +54,9 @@ def test_every_effect_acts_and_does_not_depend_on_the_integration_step(plant, la
     effects = {name: NUMBERS[name]}
     coarse, fine = (plant.simulate(lab, effects, t, v, substep=h) for h in (50e-6, 10e-6))
     plain = plant.simulate(lab, {}, t, v)
-    tolerance = 5e-4 if name in ("backlash", "driver_coast") else 1e-4  # contact, end of current: not searched for
-    moved = max(largest(fine[c] - plain[c], plain[c]) for c in ("i", "omega"))
+    # Contact, the end of a current are not searched for, or only within the steps of RK4.
+    tolerance = {"backlash": 5e-4, "driver_coast": 5e-4, "driver_one_quadrant": 1e-3}.get(name, 1e-4)
+    moved = max(largest(fine[c] - plain[c], plain[c]) for c in (("theta",) if name == "angle_lag" else ("i", "omega")))
     assert moved > (1e-6 if name in ("winding_heating", "magnet_heating", "bridge_loss") else 1e-3)
     for channel in ("i", "omega", "theta"):
         assert largest(coarse[channel] - fine[channel], fine[channel]) < min(tolerance, moved / 50)

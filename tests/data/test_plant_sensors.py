@@ -45,18 +45,19 @@ def test_speed_delay_is_pure(plant, lab, T_d):
 
 def test_lag_of_a_sensor_is_first_order(plant, lab):
     t, v = plant.step(6.0, duration=0.1)
-    r = plant.simulate(lab, {"speed_lag": {"T_w": 7e-3}, "current_lag": {"T_i": 3e-3}}, t, v)
+    lags = {"current_lag": {"T_i": 3e-3}, "speed_lag": {"T_w": 7e-3}, "angle_lag": {"T_pos": 5e-3}}
+    r = plant.simulate(lab, lags, t, v)
     A, B = state_space(lab)
-    A5 = np.zeros((5, 5))
-    A5[:3, :3] = A
-    A5[3, [0, 3]] = 1 / 3e-3, -1 / 3e-3
-    A5[4, [1, 4]] = 1 / 7e-3, -1 / 7e-3
-    E = linalg.expm(np.block([[A5, np.vstack([B, [[0], [0]]])], [np.zeros((1, 6))]]) * 1e-3)
-    x = np.zeros((len(t), 5))
+    A6 = np.zeros((6, 6))
+    A6[:3, :3] = A
+    for k, T in enumerate((3e-3, 7e-3, 5e-3)):
+        A6[3 + k, [k, 3 + k]] = 1 / T, -1 / T
+    E = linalg.expm(np.block([[A6, np.vstack([B, np.zeros((3, 1))])], [np.zeros((1, 7))]]) * 1e-3)
+    x = np.zeros((len(t), 6))
     for k in range(len(t) - 1):
-        x[k + 1] = E[:5, :5] @ x[k] + E[:5, 5] * v[k]
-    assert largest(r["i"] - x[:, 3], x[:, 3]) < 1e-4
-    assert largest(r["omega"] - x[:, 4], x[:, 4]) < 1e-4
+        x[k + 1] = E[:6, :6] @ x[k] + E[:6, 6] * v[k]
+    for k, channel in enumerate(("i", "omega", "theta"), 3):
+        assert largest(r[channel] - x[:, k], x[:, k]) < 1e-4, channel
 
 
 def test_sensor_errors_leave_the_motor_alone(plant, lab):

@@ -116,7 +116,8 @@ def test_exported_c_says_how_many_sub_steps_it_needs(tmp_path):
     wanted = np.array(functions["simulate_0"](s, u, p)[0])
 
     def error(m: int) -> float:
-        walk = simulation("walk", functions, run.grid.t, np.full(len(run.grid.t) - 1, m), [True])
+        walk = simulation("walk", functions, run.grid.t, np.full(len(run.grid.t) - 1, m),
+                          np.zeros((len(run.grid.t) - 1, 1)))
         return float((np.abs(np.array(walk(s, u, p)[0]) - wanted).max(axis=1) / np.ptp(wanted, axis=1)).max())
 
     assert error(found.substeps) < 1e-3

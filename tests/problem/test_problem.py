@@ -12,7 +12,7 @@ from lab_records import NOISE, VALUES, drive, noisy, pair, simulated
 import motorid as mi
 from motorid.errors import DataError, ModelError, UsageError
 from motorid.estimation.least_squares import RACE, least_squares
-from motorid.exporters.casadi_file import runs_of
+from motorid.exporters.casadi_file import functions_of, runs_of
 from motorid.problem.problem import as_problem
 from motorid.problem.runs import initial_state, time_since, top_acceleration
 from motorid.problem.simulate import simulate
@@ -30,6 +30,24 @@ def holed(run, channel, rng, share=0.3):
     y = np.array(run.outputs[channel])
     y[rng.random(run.n) < share] = np.nan
     return run.with_(outputs={**run.outputs, channel: y})
+
+
+# -- inputs --------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("shape", ["sine", "steps"])
+def test_over_a_few_samples_left_out_a_voltage_goes_on_as_evenly_as_beside(shape, rng):
+    t = 0.003 * np.arange(1200)
+    v = 8 * np.sin(5 * t) if shape == "sine" else np.where(np.floor(t / 0.3) % 2 == 1, 6.0, 0.0)
+    whole = simulated(t, v, ("theta",)).outputs["theta"]
+    steps = np.flatnonzero(np.diff(v)) + 1 if shape == "steps" else []
+    kept = np.setdiff1d(np.arange(1200), np.setdiff1d(rng.choice(np.arange(3, 1190), 60, replace=False), steps))
+    assert 1100 < len(kept) < 1200
+    run = mi.Experiment(t[kept], {"v": v[kept]}, {"theta": whole[kept]})
+    theta = simulate(TRUE, run, initial="rest")[0].outputs["theta"]
+    assert np.abs(theta - whole[kept]).max() < (2e-4 if shape == "sine" else 1e-6) * np.ptp(whole)
+    fit = mi.fit(TRUE.fix(*TRUE.parameters).free("K"), run)
+    exported = {f.name(): f for f in functions_of(fit)}
+    y = np.array(exported["simulate_0"](*(exported["record_0"]()[n] for n in "sup"))[0])
+    np.testing.assert_allclose(y[0], fit.simulations[0].outputs["theta"], atol=1e-9 * np.ptp(whole))
 
 
 # -- residuals -----------------------------------------------------------------------------------------------

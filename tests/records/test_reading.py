@@ -358,6 +358,22 @@ def test_missing_outputs_stay_missing_and_missing_inputs_are_held(tmp_path):
         assert part in notes(run)
 
 
+def test_a_few_cells_missing_from_a_voltage_that_changes_evenly_go_on_and_a_step_waits(tmp_path, rng):
+    t = 0.002 * np.arange(400)
+    gone = np.zeros(400, bool)
+    gone[rng.choice(np.arange(3, 390), 25, replace=False)] = True
+    gone[[199, 200, 201]] = True  # around the step
+    gone[300:306] = True  # too many in a row to tell
+    for v in (6 * np.sin(9 * t), np.where(t < 0.4, 5.0, -2.0)):
+        cells = [f"{x:.3f},{'' if lost else f'{u:.6f}'},1" for x, u, lost in zip(t, v, gone, strict=True)]
+        found = read_csv(write(tmp_path, "\n".join(["t_s,u_V,omega_rad_s", *cells]))).inputs["v"]
+        if v[0]:
+            np.testing.assert_array_equal(found, np.where(np.arange(400) < 202, 5.0, -2.0))
+        else:
+            np.testing.assert_allclose(np.delete(found, np.s_[300:306]), np.delete(v, np.s_[300:306]), atol=2e-3)
+            np.testing.assert_allclose(found[300:306], v[299], atol=1e-6)
+
+
 @pytest.mark.parametrize("mark", [-9999, 9999, -999, 65535, -32768])
 def test_the_mark_of_a_missing_sample_is_no_value(mark, tmp_path):
     w = [0, 1, mark, 3, 4, mark, 6, 7, 8, 9]

@@ -1,7 +1,5 @@
 """The same fit in three formulations: plain, constraints as penalties, constraints kept exactly."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

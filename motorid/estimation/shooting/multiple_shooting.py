@@ -4,8 +4,6 @@ States at nodes are unknowns, so a poor start or a drifting record does no harm:
 data. At the solution the intervals join, unless process noise is allowed: then their gaps show where the model fails.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
