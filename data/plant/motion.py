@@ -55,7 +55,7 @@ class Plant:
         self._s = (0 if omega0 == 0 else 1 if omega0 > 0 else -1) if self._level else FREE
         self._sensors = Chain(hooks, omega0)
         self._v, self._coasts = 0.0, any("diodes" in h for h in hooks)
-        self._one_way = any("one way" in h for h in hooks)
+        self._one_way = next((h["diodes"] for h in hooks if "one way" in h), 0.0)
         self._limit = min((h["limit"] for h in hooks if "limit" in h), default=inf)
         self._lag = sum(h["lag"] for h in hooks if "lag" in h)
         self._slew = min((h["slew"] for h in hooks if "slew" in h), default=inf)
@@ -77,6 +77,8 @@ class Plant:
         for k in range(n):
             i, a, b = self._y[0], v + k * slope, v + (k + 1) * slope
             a, b = self._behind(a, b, h) if self._lag or self._slew < inf else (a, b)
+            if self._one_way:
+                self._carry(a)
             before, moved = self._y, self._s
             self._advance(a, b, h)
             if self._one_way and i * self._y[0] < 0:  # to where the current ends, and on from there
@@ -86,6 +88,7 @@ class Plant:
                     self._advance(a, a + part * (b - a), part * h)
                     low, high = (part, high) if i * self._y[0] > 0 else (low, part)
                 self._y[0] = 0.0
+                self._carry(b)
                 self._advance(a + part * (b - a), b, (1 - part) * h)
             if self._coasts and v == 0 == slope and i * self._y[0] <= 0:
                 self._y[0] = 0.0  # the diodes let no current turn round
@@ -94,6 +97,14 @@ class Plant:
             self.t = t0 + (k + 1) * h
             self._sensors.sample(self.t, h, self._y[0], self._y[1])
         return self.measured()
+
+    def _carry(self, v: float) -> None:
+        """Say what is across a winding whose current flows along the command v alone."""
+        i, w = self._y[:2]
+        if i:
+            self._rates.carried[0] = None if i * v > 0 else -copysign(self._one_way, i)
+        else:
+            self._rates.carried[0] = None if (v - self.motor.K * w) * v > 0 else 0.0
 
     def _behind(self, v0: float, v1: float, h: float) -> tuple[float, float]:
         """Voltage of the driver at both ends of a step of h seconds, exact for a command that goes straight."""
@@ -185,7 +196,7 @@ def _physics(m: Motor, hooks: list[dict], omega0: float, theta0: float) -> tuple
     drives, drops, torques, dries, heats = (every(k) for k in ("drive", "drop", "torque", "dry", "heat"))
     f_R, f_L, f_K, f_Kt, f_Ke, bridges = (every(k) for k in ("R", "L", "K", "Kt", "Ke", "bridge"))
     diodes, limit = every("diodes"), min(every("limit"), default=None)
-    one_way = bool(every("one way"))
+    one_way, carried = bool(every("one way")), [None]  # the voltage while the command does not act, 0.0: no current
     parts, fluxes, x0 = [], [], []
     for h in hooks:
         if "part" in h:
@@ -207,10 +218,7 @@ def _physics(m: Motor, hooks: list[dict], omega0: float, theta0: float) -> tuple
         """Voltage across the winding and what the effects make of R, L, K, Kt, Ke."""
         i, w, th, dT = y[0], y[1], y[2], y[3]
         R, L, K, Kt, Ke = R0, L0, K0, 1.0, 1.0
-        opened = diodes and v == 0
-        if one_way and v:
-            along = 1 if v > 0 else -1
-            opened = i * along < 0 or (i == 0 and (v - K0 * w) * along <= 0)
+        opened = diodes and v == 0 and not one_way
         if shaped:
             for f in drives:
                 v = f(v, w)
@@ -233,6 +241,8 @@ def _physics(m: Motor, hooks: list[dict], omega0: float, theta0: float) -> tuple
                 Ke *= f(th)
         if opened:
             v = -diodes[0] if i > 0 else diodes[0] if i < 0 else K * Ke * w  # no current, no voltage across the winding
+        if one_way and carried[0] is not None:
+            v = carried[0] if carried[0] else K * Ke * w
         return v, R, L, K, Kt, Ke
 
     def rates(y: list[float], v: float, s: int, t: float) -> list[float]:
@@ -254,6 +264,7 @@ def _physics(m: Motor, hooks: list[dict], omega0: float, theta0: float) -> tuple
             out[1] = (torque if s == FREE else torque - s * level(i, w, th, s, t)) / J
         return out
 
+    rates.carried = carried
     return rates, level if dries else None, x0
 
 

@@ -20,6 +20,7 @@ from motorid.diagnosis.misspecification import Grade
 from motorid.diagnosis.results import Candidate, Rung
 from motorid.diagnosis.verdict import (
     adequate_text,
+    curve_text,
     errors_text,
     missing_text,
     own_in_every_run_remark,
@@ -202,6 +203,16 @@ def test_of_what_alone_leaves_hardly_more_the_commonest_is_the_nearest(rng):
         answer = unexplained_text(tried, rungs, grades, "", remaining)
         assert f"[{nearest}]" in answer
         assert f"alone removes {100 * drops[nearest]:.0f} %" in answer
+
+
+@pytest.mark.parametrize(("missed", "said"), [
+    (0.02, " The nearest closed form, its cube, at most 4 N·m, misses 2 % of it."),
+    (3e-9, " The nearest closed form, its cube, at most 4 N·m, misses less than 0.1 % of it."), (0.2, "")])
+def test_the_closed_form_that_a_curve_is_but_for_a_trifle_is_told(missed, said):
+    forms = [("its cube, at most 4 N·m", missed), ("a straight line, at most 3 N·m", 0.9)]
+    rungs = rungs_of((0.1, 0.2), held_out=[(0.2, 0.3)])
+    assert curve_text(rungs, {"omega": 0.01}, forms) == f"With that as a curve on held-out runs: speed 30 → 1 %.{said}"
+    assert curve_text(rungs, {}, forms) == ""
 
 
 def test_errors_beyond_the_noise_are_in_the_answer_where_nothing_is_missing():

@@ -921,6 +921,7 @@ def test_where_nothing_is_named_the_curve_leads_if_there_is_time(lab, monkeypatc
     assert by_curve.remainder.follows == "an error of the angle sensor that depends on the distance since a reversal"
     assert by_curve.remainder.follows in by_curve.answer
     assert "With that as a curve on held-out runs: " in by_curve.answer
+    assert "The nearest closed form, a slack of 0.11 rad, at most 0.055 rad, misses less than 0.1 %" in by_curve.answer
     monkeypatch.setattr(Remainder, "_best", None)  # no curve helps
     without = found()
     assert not without.remainder.proposed
