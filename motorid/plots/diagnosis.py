@@ -112,7 +112,7 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     """
     style.refuse_other(found, Diagnosis, "plot_answer takes a diagnosis, mi.diagnose(fit)")
     m = found.missing
-    balance = "voltage" if found.where == "electrical" and any(map(np.any, m.voltage)) else "torque"  # if not apart
+    balance = "voltage" if found.where == "electrical" and any(map(np.any, m.voltage)) else "torque"  # also for both
     had = accounted(found.before, found.after)[balance == "torque"] if found.after is not found.before else None
     against, periods = _quantity(found, balance, had)
     x = np.concatenate([np.asarray(s[against]) * periods for s in m.signals])

@@ -47,7 +47,7 @@ class Experiment(Shown):
     sigma : mapping of str to float, optional
         Standard deviation of the measurement noise per output channel, where it is known.
     hold : {"zoh", "linear"}
-        What the input does between samples: held from each sample to the next, or joined by lines.
+        What the input does between samples: held, going on evenly over a few left out, or joined by lines.
     units : mapping of str to str, optional
         SI unit per channel, by default V, A, rad/s, rad; m and m/s make a linear axis.
     name : str

@@ -52,7 +52,7 @@ def read_runs(paths: Path_ | Iterable[Path_], *, columns: Mapping[str, object] |
     units : mapping, optional
         Channel or column to unit: ``{"omega": "rpm", "theta": "counts:2048", "i": "-1 A", "v": "us:1500"}``.
     hold : {"zoh", "linear"}, optional
-        The input between samples; by default what the file says (see `write_csv`), else "zoh".
+        The input between samples (see `Experiment`); by default what the file says (see `write_csv`), else "zoh".
     dt : float, optional
         Time between samples, s, of records without a column of time.
 
