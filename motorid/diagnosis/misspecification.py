@@ -17,7 +17,7 @@ from motorid.diagnosis.admissibility import objections
 from motorid.diagnosis.free_forms import Form, Linear, Span
 from motorid.diagnosis.model_comparison import Node, evidence, far, share_of
 from motorid.diagnosis.predictive_score import QUICK, Evidence, Predictions, compare
-from motorid.diagnosis.thresholds import MOST, NATS, PLAIN, STANDARD_ERRORS, SUPPLANTS, TRIFLE, UNCONTESTED
+from motorid.diagnosis.thresholds import MOST, PLAIN, STANDARD_ERRORS, SUPPLANTS, TRIFLE, UNCONTESTED
 from motorid.display.numbers import listed, number, percent
 from motorid.errors import ModelError, otherwise
 from motorid.estimation.angle_orders import uses_angle
@@ -307,10 +307,12 @@ def _half_a_sample(fit: Fit, effect: Effect) -> bool:
     late, unsure = share * fit.values[name], STANDARD_ERRORS * share * (fit.std.get(name) or 0.0)
     if abs(late - half) < max(TRIFLE * half, min(unsure, half)):
         return True
-    if "i" in fit.problem.outputs or late > AS_LATE * half:
-        return False  # without a current the winding's own lag may make up for the rest
+    if late > AS_LATE * half:
+        return False  # else the winding's own lag, or the noise of counts, may make up for the rest
     held = fit.problem.with_(model=fit.model.fix(**{name: half / share}))
-    return otherwise(False, FAILURES, lambda: solve(held, QUICK, start="model").cost < fit.cost + NATS)
+    other = otherwise(None, FAILURES, lambda: solve(held, QUICK, start="model"))
+    both = [f and predictive_score.predictions_left_out(f) for f in (other, fit)]
+    return all(both) and not compare(*(Predictions(known or {}, {}) for known in both)).worth_it
 
 
 def _within_smoothing(fit: Fit, effect: Effect) -> str:

@@ -96,15 +96,14 @@ def quantum(y: ArrayLike) -> float:
 
 def going_on(t: Array, u: Array) -> Array:
     """Return which share of its change from one sample to the next what is held between samples, `u` (N, ...), does by
-    the way, (N-1, ...): where a few samples were left out, and it changed as evenly across them as beside."""
+    the way, (N-1, ...): where a few were left out of what changes with every sample, about as much across as beside."""
     dt = np.diff(t)
     steps = (dt / (np.median(dt) if len(dt) else 1.0)).reshape(-1, *[1] * (u.ndim - 1))
-    rates = np.pad(np.diff(u, axis=0) / steps, [(1, 1), *[(0, 0)] * (u.ndim - 1)])
+    rates = np.pad(np.abs(np.diff(u, axis=0)) / steps, [(1, 1), *[(0, 0)] * (u.ndim - 1)])
     before, across, after = rates[:-2], rates[1:-1], rates[2:]
-    slack = np.maximum(np.abs(before), np.abs(after)) / 2
-    even = (across >= np.minimum(before, after) - slack) & (across <= np.maximum(before, after) + slack)
+    alike = (np.minimum(before, after) > 0) & (across <= 2 * np.maximum(before, after))
     few = (steps > 1.5) & (steps < MOST_LEFT_OUT + 1.5) & (np.abs(steps - steps.round()) < 0.1)
-    return np.where(few & even, 1 - 1 / steps, 0.0)
+    return np.where(few & alike, 1 - 1 / steps, 0.0)
 
 
 def repeats(y: Array) -> NDArray[np.bool_]:

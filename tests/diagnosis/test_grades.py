@@ -564,6 +564,21 @@ def test_half_a_sample_is_told_where_no_current_keeps_it_apart_from_the_winding(
     assert misspecification._half_a_sample(fit, LIBRARY["speed_lag"]) is (lag == 0)
 
 
+@pytest.mark.parametrize(("kept", "told"), [(0.15, True), (0.4, False)])
+def test_what_a_speed_of_few_lines_is_later_than_half_a_sample_must_matter(kept, told):
+    """In a blind trial a lag of 2.8 ms was named where counts over 4 ms are 2 ms late; it made 0.3 % of the error."""
+    rng, t, line = np.random.default_rng(0), 4e-3 * np.arange(2500), 2 * np.pi / 200
+    motor = mi.dc_motor(R=0.78, L=1.6e-3, K=0.103, b=7e-4, J=1.2e-3)
+    blank = mi.Experiment(t, {"v": np.repeat(rng.uniform(-24, 24, 25), 100)}, {"i": 0 * t, "theta": 0 * t})
+    seen = mi.simulate(motor, blank, initial="rest")[0].outputs
+    speed = np.diff(np.round(seen["theta"] / line), prepend=0.0) * line / 4e-3
+    current = seen["i"] + 1.7 * rng.standard_normal(2500)
+    read = blank.with_(outputs={"i": current, "omega": scipy.signal.lfilter([1 - kept], [1, -kept], speed)})
+    fit = mi.fit(mi.dc_motor() + mi.effects.speed_lag, read)
+    assert fit.values["T_w"] > 2.4e-3
+    assert misspecification._half_a_sample(fit, LIBRARY["speed_lag"]) is told
+
+
 def test_what_is_open_is_no_surer_than_what_only_approximates_beside_it():
     """A driver that stretches its pulses was "pwm_coast", of open size, beside two effects of impossible size."""
     run = stepped(mi.dc_motor(R=1.2, L=1e-3, K=0.05, b=2e-4, J=2e-5) + mi.effects.coulomb(tau_c=2e-3), 1, 800, 1e-3,
