@@ -139,6 +139,8 @@ def arguments_told(thing: _Thing) -> _Thing:
         return cast(_Thing, thing)
 
     signature = inspect.signature(thing)
+    named = [p.replace(annotation=_named(p.annotation)) for p in signature.parameters.values()]
+    signature = signature.replace(parameters=named, return_annotation=_named(signature.return_annotation))
     member = "." in thing.__qualname__
     plain = {p.name for p in signature.parameters.values()
              if set(re.findall(r"\w+", str(p.annotation))) <= (_SCALAR if member else _PLAIN)}
@@ -162,7 +164,15 @@ def arguments_told(thing: _Thing) -> _Thing:
         finally:
             _within.set(within)
 
+    call.__dict__["__signature__"] = signature
     return cast(_Thing, call)
+
+
+def _named(annotation: Any) -> Any:
+    """Return an annotation as it is written, without the modules of what it names."""
+    if isinstance(annotation, type) or annotation is None:
+        return annotation if annotation is inspect.Parameter.empty else getattr(annotation, "__name__", "None")
+    return re.sub(r"(\w+\.)+(?=\w)", "", str(annotation)).replace("ndarray[tuple[Any, ...], dtype[float64]]", "Array")
 
 
 def at_least(least: float, **given: float | None) -> None:

@@ -1,7 +1,5 @@
 """Record a run from a bench: check, connect, calibrate, start, write down, stop; see `record`."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import tomllib

@@ -5,8 +5,7 @@ they depend on the motion: they are binned over speed, current, voltage and angl
 explain is compared with the same after a shift in time against the motion, which keeps the colour of both and breaks
 every real dependence (a circular-shift surrogate test, Theiler et al., Physica D 58, 1992). The library's scores, on
 effective samples, see what bins cannot. Where both are silent but the errors exceed the noise, `judgement` asks whether
-a free form predicts them on data that it was not fitted to: coloured noise cannot be predicted.
-"""
+a free form predicts them on data that it was not fitted to: coloured noise cannot be predicted."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -49,8 +48,7 @@ def adequacy(fit: Fit, scores: Sequence[Score] = (), level: float = FALSE_ALARM)
 
     `FALSE_ALARM` is the probability of calling an adequate model inadequate; `level` the p-value that does so. Fast
     changes understate coloured noise by 1/√(1−ρ): 3 times at a correlation of 0.9 between neighbours. Residuals beyond
-    ten times the noise (five for an angle) are not noise of any colour.
-    """
+    ten times the noise (five for an angle) are not noise of any colour."""
     channels = {c: _channel(fit, c) for c in fit.problem.outputs}
     asked = [c for c in channels if c not in (idle := undecided(fit))]
     tests = [*(t for c in asked for t in _dependences(fit, c)), *(_score_tests(scores) if asked else ())]

@@ -30,8 +30,7 @@ LENGTHS = ("rad", "m")  # a gap that runs to its limit is none
 def objections(fit: Fit, added: Effect, before: Fit | None = None) -> str:
     """Say why the refit must not be believed: a wrong sign, a shape at its limit; empty if it may be.
 
-    `before` is the fit without the effect.
-    """
+    `before` is the fit without the effect."""
     pars = [fit.problem.model.parameters[p.name] for p in added.parameters]
     for p, declared in zip(pars, added.parameters, strict=True):
         if p.at_least and fit.values[p.name] < 0.98 * fit.values[p.at_least]:

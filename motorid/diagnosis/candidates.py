@@ -1,8 +1,7 @@
 """Growing a model by one effect, judging the children, pruning: the moves of the search.
 
 A child must predict data that it was not fitted to better, by more than chance and by an amount that matters; see
-`predictive_score`. What else speaks against its effect is kept with it, and tells what it may be called.
-"""
+`predictive_score`. What else speaks against its effect is kept with it, and tells what it may be called."""
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

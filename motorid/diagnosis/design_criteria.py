@@ -8,8 +8,7 @@ parameters over the record. What earlier records tell enters as a Gaussian prior
   gradient needs first derivatives only (Danskin).
 - Sharpening: the product of the asked parameters' variances, the others estimated too; for one of them D_s-optimality
   (Atkinson, Donev & Tobias, Optimum Experimental Designs, 2007, ch. 10). Its gradient takes differences, along one
-  direction of the parameters each, of the exact slopes with respect to the levels.
-"""
+  direction of the parameters each, of the exact slopes with respect to the levels."""
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """diagnose(): where does the model fail, which effect is missing, and what do the records not distinguish."""
 
-from __future__ import annotations
-
 import builtins
 import time
 from collections.abc import Callable, Iterable, Sequence

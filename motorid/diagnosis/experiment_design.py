@@ -2,8 +2,7 @@
 
 `suggest_experiment` compares fixed candidates within the limits: the squared difference of the rivals' outputs over the
 noise is what a record would add to the evidence between them (Hunter & Reiner, Technometrics 7(3), 1965).
-`design_experiment` starts there and optimises the voltage; see `motorid.diagnosis.design_criteria`.
-"""
+`design_experiment` starts there and optimises the voltage; see `motorid.diagnosis.design_criteria`."""
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence

@@ -2,8 +2,7 @@
 
 Cosines over the range of a time or an angle, waves and parts of a turn or of what repeats in it, powers with jumps and
 kinks at zero for what has a sign; for what remembers, first-order lags of many lengths: a sum of them comes near any
-fading memory (Laguerre and Kautz models: Wahlberg, IEEE Trans. Automatic Control 36(5), 1991).
-"""
+fading memory (Laguerre and Kautz models: Wahlberg, IEEE Trans. Automatic Control 36(5), 1991)."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence

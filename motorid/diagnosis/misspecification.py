@@ -2,8 +2,7 @@
 
 A free form is any smooth function of one quantity, in one balance or sensor (see `free_forms`), linear in its
 coefficients, so slopes alone tell what a model with it would predict of blocks left out. A parametric law that a
-nonparametric one outdoes is not the thing itself (Härdle & Mammen, Ann. Statist. 21(4), 1993).
-"""
+nonparametric one outdoes is not the thing itself (Härdle & Mammen, Ann. Statist. 21(4), 1993)."""
 
 import contextlib
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
@@ -205,8 +204,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
     and by more than a trifle of what the effect itself does, and it explains more than it leaves, on held-out runs too,
     unless that is noise (no `structure`). A form `beside` the effect that predicts surely less than the best one only
     imitates that.
-    `without` gives the model without one of the effects, if there is one.
-    """
+    `without` gives the model without one of the effects, if there is one."""
     rivals = {g[0]: g[1:] for g in groups}
     limited = structure and LIMITER not in last.key and any(current_limit(run) for run in root.fit.problem.experiments)
     found = []

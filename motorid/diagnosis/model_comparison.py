@@ -1,7 +1,6 @@
 """Which of two models is to be preferred: by what they predict of data that they were not fitted to.
 
-On a tie the smaller model wins, then the effect that is met more often.
-"""
+On a tie the smaller model wins, then the effect that is met more often."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -246,8 +246,7 @@ def better_reading(fit: Fit, late: bool = False, earlier: bool = False) -> Readi
     It must make the error of `fit` plainly smaller, and that of no channel larger; errors that are all noise cannot
     become so. Dead times that show at the steps come first: friction and inductance would adapt to them. `late`: all
     effects that help are in, and what could stand in for one is tried too. `earlier`: only a voltage that acts earlier
-    is, whatever is missing; no motor answers before it is asked.
-    """
+    is, whatever is missing; no motor answers before it is asked."""
     chosen, fall, runs = None, PLAIN, fit.problem.experiments
     calm = all(NOISE[0] < ratio < NOISE[1] for ratio in misfit_over_noise(fit.problem, fit.q).values())
     lost = sum(run.n for run in runs if unresolved(run))

@@ -4,8 +4,7 @@ Structure comes as a curve over one quantity, or as lags of one, in one balance:
 look at and export, and as source to edit and to name. Slopes propose the curves, the best are fitted with the rest of
 the model, and what then predicts best is the answer. A few functions whose places are fitted, too (where a law bends
 or sets in, how long it remembers: splines with free knots, Jupp, SIAM J. Numer. Anal. 15(2), 1978) are preferred to
-many on a grid. Where one curve leaves what another predicts, there are several, those before chosen anew beside it.
-"""
+many on a grid. Where one curve leaves what another predicts, there are several, those before chosen anew beside it."""
 
 import contextlib
 import re

@@ -3,8 +3,7 @@
 The column that an effect would add to the Jacobian is projected off the tangent space of the fitted parameters
 (they would absorb that part anyway), and the residual is fitted with what remains, physical signs enforced: a
 score test in the sense of Rao (1948), without refitting anything. Shape parameters run over a small grid; effects
-that cannot be differentiated at their null are simulated at a few finite shapes instead.
-"""
+that cannot be differentiated at their null are simulated at a few finite shapes instead."""
 
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,8 +1,7 @@
 """The loop: rank, refit the best, keep what lowers the held-out error, drop what has become superfluous, repeat.
 
 After each addition the earlier effects are tried without, and with others in their places, so that a wrong first choice
-(Coulomb where the friction grows with the load) can be overtaken.
-"""
+(Coulomb where the friction grows with the load) can be overtaken."""
 
 import contextlib
 import time
@@ -67,8 +66,7 @@ class Climb:
 def climb(search: Search, max_effects: int, seconds: float | None = None, early: bool = False) -> Climb:
     """Run the loop until nothing more is worth adding, until the time is up, or until it is interrupted (Ctrl-C).
 
-    What was found by then is the answer; `stopped` says so. `early`: also until a voltage turns out to act earlier.
-    """
+    What was found by then is the answer; `stopped` says so. `early`: also until a voltage turns out to act earlier."""
     began = time.monotonic()
     scores = search.scores(search.root)
     first = judge_adequacy(search.root, scores)

@@ -2,8 +2,7 @@
 
 The answer of the outputs to sin(Nθ) and cos(Nθ) torques along the measured angle, for all N at once, projected off the
 tangent space of the fit like any other score, both without their colour (`whitening`). Each order is looked for where
-less than a quarter of a period passes per sample: there no alias and no delay of a sensor can pose as it.
-"""
+less than a quarter of a period passes per sample: there no alias and no delay of a sensor can pose as it."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress

@@ -2,8 +2,7 @@
 
 Friction makes the misfit rugged: a parameter moves the instant at which a speed passes through zero. A wide sgn smooths
 this over, and its minimum leads to the right one (numerical continuation, Allgower & Georg, 1990). On the EMPS record
-five starts within a factor of three ended at 2.61-3.01 mm with the final width alone, and all at 2.551 mm in stages.
-"""
+five starts within a factor of three ended at 2.61-3.01 mm with the final width alone, and all at 2.551 mm in stages."""
 
 from contextlib import suppress
 from dataclasses import replace
@@ -30,8 +29,7 @@ def by_continuation(problem: Problem, effort: LevenbergMarquardt, callback: Call
 
     One least-squares run where the model has no sgn, or one whose width was given. `wide` begins with a wide sgn,
     `narrow` ends with a narrower one where that lowers the cost, see `sharpened`; the `looks` of `effort` count the
-    restarts at the first width. Raises `FitError` if the model cannot be simulated at the start.
-    """
+    restarts at the first width. Raises `FitError` if the model cannot be simulated at the start."""
     widths = _widths(problem) if wide and smooths(problem) else (problem.width,)
     here, history, ends, last = problem, (), [], len(widths) - 1
     for k, width in enumerate(widths):
@@ -59,8 +57,7 @@ def past_ripples(found: Estimate, effort: LevenbergMarquardt, callback: Callback
     """Return the estimate led on from where it stalled by the slopes of a wider sgn, if that lowers the cost.
 
     With a narrow sgn the instants at which a motor sticks and breaks away ripple the cost, and its own slopes lead into
-    the nearest ripple; those of a wider one follow the valley. What ends at the noise is left as it is.
-    """
+    the nearest ripple; those of a wider one follow the valley. What ends at the noise is left as it is."""
     problem = found.problem
     if found.solution.status == "converged" or not smooths(problem) or \
             max(misfit_over_noise(problem, found.q).values(), default=0.0) < NOISE:

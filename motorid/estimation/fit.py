@@ -1,7 +1,5 @@
 """fit(): from a model and records to parameter values; the stages of a fit, in their order."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 import warnings
@@ -268,8 +266,7 @@ def _reweighted(found: Estimate) -> dict[str, float] | None:
     A model that cannot reach the noise would otherwise spend itself on the channel with the smallest noise
     (an encoder), at any price in the others. Noise and misfit together give the maximum of the likelihood
     with the channels' variances as unknowns, ``Σ n·ln(SSR)`` (Seber & Wild, Nonlinear Regression, 1989, ch.
-    11); a model that reaches the noise keeps the weights of the noise.
-    """
+    11); a model that reaches the noise keeps the weights of the noise."""
     problem = found.problem
     if problem.weights != "noise" or problem.loss is not None or len(problem.outputs) < 2:
         return None
@@ -328,8 +325,7 @@ def in_windows(fit: Fit, solve: Callable[[Problem], Fit] = solve, drifts: bool =
 
     Of records that it follows as a whole only where it leaves noise there, and more than that on the whole: a detent
     that catches the motor or not turns on what no sensor shows. `solve` fits a problem. What `drifts` sums up a small
-    error of a force instead, and only windows that it follows are asked for.
-    """
+    error of a force instead, and only windows that it follows are asked for."""
     problem, model = fit.problem, fit.model.with_(angle_input=False)
     whole = follows(fit) and not fit.model.angle_input and not drifts
     longest = max(r.duration for r in problem.experiments)

@@ -60,8 +60,7 @@ def least_squares(problem: Problem, effort: LevenbergMarquardt, callback: Callba
     """Minimise the cost of `problem` from the values of its model, or from `q`.
 
     `refine` chooses the sub-steps anew where the solution goes: those chosen far off hide what rings between samples.
-    The run is repeated at most `rounds` times while they do not suit. `FitError`: the start cannot be simulated.
-    """
+    The run is repeated at most `rounds` times while they do not suit. `FitError`: the start cannot be simulated."""
     q, history = problem.start if q is None else q, ()
     for _ in range(rounds):
         here = _Refining(problem) if refine else problem

@@ -6,8 +6,7 @@ first, the second by smaller first steps; what resists both is begun nearby. So 
 each shipped motor all ended in its optimum, and 97 % within a factor of a hundred (bench_starts.py).
 
 A parameter that a run has driven to nothing has collapsed: on a logarithmic scale the cost is flat there. Put back to
-where it would matter, it comes to its value, or goes away again.
-"""
+where it would matter, it comes to its value, or goes away again."""
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """What an estimation found: `Fit`, `Failure` where it did not come through, and fits side by side: `compare`."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -130,8 +128,7 @@ class Fit(Shown):
         """One standard deviation per parameter, in its unit: 0 where fixed, None where the data do not determine it.
 
         For coloured residuals: those of a model that lacks something go with the motion, and taken as white noise
-        they would make its parameters far too certain.
-        """
+        they would make its parameters far too certain."""
         known = dict(zip((p.name for p in self.problem.unknown), self._certainty.std, strict=True))
         return {n: known.get(n, 0.0) for n in self.values}
 
@@ -155,8 +152,7 @@ class Fit(Shown):
         """Whether the model explains the records.
 
         ``"noise"``: no error is more than three times the noise, which colour can do; ``"poor"``: some is;
-        ``"lost"``: a channel is not followed at all, or there is no result.
-        """
+        ``"lost"``: a channel is not followed at all, or there is no result."""
         if self.status == "failed" or not largest(self.nrmse) < LOST:
             return "lost"
         return "poor" if max(self.misfit.values(), default=0.0) > COLOURED else "noise"

@@ -18,7 +18,7 @@ from motorid.exporters.json_file import fit_dict
 from motorid.integrate.rodas3 import StepFunctions
 from motorid.model.equations import System
 from motorid.model.model import SHOWN, Model
-from motorid.numerics.signals import Array, going_on
+from motorid.numerics.signals import Array
 from motorid.problem.plain_data import model_dict
 from motorid.problem.problem import Problem
 from motorid.problem.runs import Run, zoh_inputs
@@ -124,8 +124,10 @@ def records_of(found: Fit | Model | Problem) -> list[dict[str, Any]]:
     if isinstance(found, Model):
         return []
     problem, q = (found.problem, found.q) if isinstance(found, Fit) else (found, found.start)
+    inputs = problem.system.inputs
     return [{"t": run.grid.t.tolist(), "s": start.tolist(), "p": p.tolist(), "u": run.grid.u.T.tolist(),
-             "substeps": run.grid.substeps.tolist(), "held": zoh_inputs(problem.system.inputs, run.experiment.hold)}
+             "substeps": run.grid.substeps.tolist(), "held": (held := zoh_inputs(inputs, run.experiment.hold)),
+             "way": [[*map(int, at), float(run.grid.way[*at])] for at in np.argwhere(run.grid.way * held)]}
             for run, start, p in runs_of(problem, q)[:MOST_RUNS]]
 
 
@@ -174,9 +176,12 @@ def _simulations(functions: Mapping[str, ca.Function], records: Sequence[Mapping
         t, u, m = np.array(r["t"], float), np.array(r["u"], float), np.array(r["substeps"], np.int64)
         if m.min() < 1 or m.sum() > MOST_SCALARS or (len(t), len(m)) != (u.shape[1], len(t) - 1):
             raise ValueError(f"record {k}")
+        way = np.tile(1.0 - np.array(r["held"], float), (len(m), 1))
+        for i, j, share in r.get("way", ()):
+            way[i, j] = share
         p = ca.DM(r["p"]) if "p" in r else functions["parameters"]()["p"]
         found += [ca.Function(f"record_{k}", [], [ca.DM(t).T, ca.DM(r["s"]), ca.DM(u), p], [], ["t", "s", "u", "p"]),
-                  simulation(f"simulate_{k}", functions, t, m, np.where(r["held"], going_on(t, u.T), 1.0))]
+                  simulation(f"simulate_{k}", functions, t, m, way)]
     return found
 
 

@@ -1,7 +1,5 @@
 """Taking a fitted model along: a file of CasADi functions, C source, JSON; and back."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

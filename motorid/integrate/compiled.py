@@ -1,8 +1,7 @@
 """Generated C, compiled once per model and kept on disk by content; never needed, only faster.
 
 A library holds CasADi's code of one step, another the driver that walks over a record of any length with any step, so
-nothing is compiled again for another run length, number of sub-steps or set of free parameters.
-"""
+nothing is compiled again for another run length, number of sub-steps or set of free parameters."""
 
 import ctypes
 import hashlib
@@ -41,8 +40,7 @@ def cache_dir() -> Path | None:
     """Return the folder of compiled steps, ``$MOTORID_CACHE``, else one in the user's cache folder, made if need be.
 
     What is in it is loaded and so can do anything: None (said once) where it belongs to another user, or others may
-    write to it or to the folder it is in (unless that is sticky, like /tmp).
-    """
+    write to it or to the folder it is in (unless that is sticky, like /tmp)."""
     try:
         base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = Path(os.environ.get("MOTORID_CACHE") or Path(base) / "motorid").expanduser().resolve()

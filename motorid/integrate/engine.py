@@ -47,6 +47,18 @@ class Grid:
         """Return the grid with other sub-steps."""
         return replace(self, substeps=np.ascontiguousarray(substeps, np.int64))
 
+    @property
+    def way(self) -> Array:
+        """Shares of their change to the next sample that the inputs do before that, evenly, (N-1, nu)."""
+        change = np.diff(self.u, axis=0)
+        return (self.u1 - self.u0) / np.where(change != 0, change, 1.0)
+
+    def with_way(self, j: int, way: Array) -> "Grid":
+        """Return the grid with input `j` doing shares `way` (N-1,) of its changes between samples, evenly."""
+        ends = self.u1.copy()
+        ends[:, j] = self.u0[:, j] + way * np.diff(self.u[:, j])
+        return replace(self, u1=ends)
+
     def part(self, a: int, b: int) -> "Grid":
         """Return samples a to b, both included."""
         return Grid(self.t[a:b + 1], self.u[a:b + 1], self.u0[a:b], self.u1[a:b], self.substeps[a:b])
@@ -81,14 +93,12 @@ class Engine(Protocol):
         """Return the trajectory from `x0` (nx,) with parameters `p` (np,).
 
         `dx0` (nx, nq) and `dp` (np, nq) are the derivatives of both with respect to the unknowns q. SimulationError,
-        which names the time, if the integration does not reach the end.
-        """
+        which names the time, if the integration does not reach the end."""
         ...
 
     def prepare(self, system: System, grid: Grid, x0: Array, p: Array, tolerance: Tolerance) -> Grid:
         """Return the grid with its sub-steps chosen for an error of `tolerance` per interval, relative to the states.
 
         It may depend on the trajectory reached so far: then it is a smaller and a larger one, and the error (ny,) of
-        each output that decides between these for each state. An engine that chooses its own steps takes any grid.
-        """
+        each output that decides between these for each state. An engine that chooses its own steps takes any grid."""
         return grid

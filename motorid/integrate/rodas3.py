@@ -2,8 +2,7 @@
 
 RODAS3 of Sandu et al., "Benchmarking stiff ODE solvers for atmospheric chemistry problems II: Rosenbrock
 solvers", Atmospheric Environment 31(20), 1997: four stages, three right-hand sides, order 3 with an embedded
-order 2, stiffly accurate, so that it also carries algebraic balances (a motor without inductance).
-"""
+order 2, stiffly accurate, so that it also carries algebraic balances (a motor without inductance)."""
 
 from dataclasses import dataclass
 from functools import cached_property

@@ -63,8 +63,7 @@ class Rosenbrock:
         (Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, 1993, II.4): a current that settles
         before the next sample needs no steps of its own. A step that goes astray, or leaves the finite numbers, spoils
         all after it, which is then neither refined for nor a measure of size. It has not where half the steps end
-        alike; where no more are to be had, every later run on this grid fails, too.
-        """
+        alike; where no more are to be had, every later run on this grid fails, too."""
         passes, right, shown = float(MOST_PASSES), 0, None
         while passes > 0:
             try:

@@ -3,8 +3,7 @@
 A call never spans a jump of the input (CVODES stops there): the record is cut where the input changes. Parts of evenly
 spaced samples under one constant input are walked in one go over scaled time, by the next larger of a few integrators
 (2, 3, 4, 6, 8, 12 … samples), which serve every record. Derivatives are taken in forward mode, over scaled states;
-without `quad_err_con` CasADi's CVODES interface can return wrong ones silently (casadi issue 4383).
-"""
+without `quad_err_con` CasADi's CVODES interface can return wrong ones silently (casadi issue 4383)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

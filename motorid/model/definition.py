@@ -1,7 +1,5 @@
 """What a user declares: parameters with units and limits, and effects, whose laws write on the sheet of equations."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import re
@@ -135,7 +133,7 @@ class Effect(Shown):
         """The first parameter that makes the effect vanish at its null value, if there is one."""
         return next((p for p in self.parameters if p.null is not None), None)
 
-    def __call__(self, **values: float) -> Effect:
+    def __call__(self, **values: float) -> "Effect":
         """Return the effect with some parameters given, e.g. ``cogging(N=12)`` (fixed if it is an order)."""
         known = {p.name: p for p in self.parameters}
         for name in values:

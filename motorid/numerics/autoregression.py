@@ -1,8 +1,7 @@
 """Coloured residuals: autocovariance, autoregressive models of them, filters that whiten them, effective samples.
 
 An autoregression needs few numbers for noise whose neighbours are alike, and its covariance is positive definite; a
-truncated sample autocovariance is not (Percival & Walden, Spectral Analysis for Physical Applications, 1993, ch. 9).
-"""
+truncated sample autocovariance is not (Percival & Walden, Spectral Analysis for Physical Applications, 1993, ch. 9)."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

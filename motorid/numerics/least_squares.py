@@ -8,8 +8,7 @@ looks like a minimum. The usual D, column norms of J (Moré, 1978), hardly brake
 of e costs λ times the present misfit, so a parameter that the misfit does not ask for stays until its turn comes.
 Damping by ‖r‖² converges globally, and quadratically even where J is singular (Yamashita & Fukushima, Computing Suppl.
 15, 2001; Fan & Yuan, Computing 74, 2005). λ follows the gain ratio (Nielsen, IMM-REP-1999-05). Of 100 starts within a
-factor of ten 99 end in the optimum, 75 to 94 with the column norms; see `motorid.estimation.restarts`.
-"""
+factor of ten 99 end in the optimum, 75 to 94 with the column norms; see `motorid.estimation.restarts`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -124,8 +123,7 @@ def levenberg_marquardt(residual: Callable[[Array], Array], both: Callable[[Arra
     `residual` is ``q -> r`` (n,) and may raise `SimulationError`; `both` is ``q -> (r, jac)``, jac (n, nq), called at
     the start and after every accepted step only, so that it may refine what `residual` does there; the callback
     (iteration, cost, q) is called then, too. FitError if the residual cannot be computed at the start, OutOfTime if
-    the budget of time around the call is spent.
-    """
+    the budget of time around the call is spent."""
     o = options or LevenbergMarquardt()
     search = _Search(residual, both, np.asarray(q0, float), bounds, o, log)
     history, end, enough = [search.cost], "limit", o.patience * o.crawl * o.ftol

@@ -202,8 +202,7 @@ def map_items(function: Callable[[Any, Any], Any], shared: Any, items: Sequence[
 
     `function` stands at a module's top level and returns failures instead of raising them. `shared` travels once per
     process, small items in chunks; `each` is called with every result as it comes. An interruption keeps what is done;
-    if the pool breaks (a worker was killed), the rest is done in this process: that costs time, not results.
-    """
+    if the pool breaks (a worker was killed), the rest is done in this process: that costs time, not results."""
     parcel = Parcel.of(shared)
     size = 1 if map is None or map is builtins.map else max(-(-len(items) // MOST_TASKS), 1)
     tasks = [Task(parcel, Parcel.of(items[k:k + size]), function) for k in range(0, len(items), size)]

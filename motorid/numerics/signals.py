@@ -94,16 +94,22 @@ def quantum(y: ArrayLike) -> float:
     return 0.0
 
 
+def left_out(t: Array) -> NDArray[np.intp]:
+    """Return how many samples, if a few, were left out after each but the last, (N-1,)."""
+    dt = np.diff(t)
+    steps = dt / (np.median(dt) if len(dt) else 1.0)
+    few = (steps > 1.5) & (steps < MOST_LEFT_OUT + 1.5) & (np.abs(steps - steps.round()) < 0.1)
+    return np.where(few, steps.round() - 1, 0).astype(np.intp)
+
+
 def going_on(t: Array, u: Array) -> Array:
     """Return which share of its change from one sample to the next what is held between samples, `u` (N, ...), does by
     the way, (N-1, ...): where a few were left out of what changes with every sample, about as much across as beside."""
-    dt = np.diff(t)
-    steps = (dt / (np.median(dt) if len(dt) else 1.0)).reshape(-1, *[1] * (u.ndim - 1))
-    rates = np.pad(np.abs(np.diff(u, axis=0)) / steps, [(1, 1), *[(0, 0)] * (u.ndim - 1)])
+    more = left_out(t).reshape(-1, *[1] * (u.ndim - 1))
+    rates = np.pad(np.abs(np.diff(u, axis=0)) / (1 + more), [(1, 1), *[(0, 0)] * (u.ndim - 1)])
     before, across, after = rates[:-2], rates[1:-1], rates[2:]
     alike = (np.minimum(before, after) > 0) & (across <= 2 * np.maximum(before, after))
-    few = (steps > 1.5) & (steps < MOST_LEFT_OUT + 1.5) & (np.abs(steps - steps.round()) < 0.1)
-    return np.where(few & alike, 1 - 1 / steps, 0.0)
+    return np.where(alike, more / (1 + more), 0.0)
 
 
 def repeats(y: Array) -> NDArray[np.bool_]:
@@ -172,8 +178,7 @@ def noise_level(y: ArrayLike, t: ArrayLike | None = None) -> float:
     so is what a sensor that measures every few samples repeats. The result is never below what rounding alone does
     (step/√12, where the channel moves in steps), nor 1e-5 of the channel's variation. Smooth noise is underestimated
     (four times, with a correlation of 0.9 between neighbours), two or three samples per time constant overestimated.
-    Gasser, Sroka and Jennen-Steinmetz, Biometrika 73(3), 1986; Hall, Kay and Titterington, Biometrika 77(3), 1990.
-    """
+    Gasser, Sroka and Jennen-Steinmetz, Biometrika 73(3), 1986; Hall, Kay and Titterington, Biometrika 77(3), 1990."""
     values = np.asarray(y, dtype=float)
     times = np.arange(values.size, dtype=float) if t is None else np.asarray(t, dtype=float)
     keep, step = np.isfinite(values) & np.isfinite(times), quantum(values)

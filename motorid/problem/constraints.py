@@ -1,8 +1,7 @@
 """What a fit must respect beside the data: a current limit, the steady state, a relation of the user's own.
 
 As a *penalty* its rows add to the least-squares residual (`Relation.evaluate`); as a *true constraint* of
-`MultipleShooting` they stay between limits (`Relation.parts`).
-"""
+`MultipleShooting` they stay between limits (`Relation.parts`)."""
 
 import warnings
 import weakref

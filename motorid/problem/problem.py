@@ -11,19 +11,21 @@ from numpy.typing import NDArray
 from motorid.channels import CHANNELS
 from motorid.errors import ModelError, SimulationError, UsageError, among, name_of, otherwise
 from motorid.integrate import engine_of, limited
-from motorid.integrate.engine import Engine, Tolerance, Trajectory
+from motorid.integrate.engine import Engine, Grid, Tolerance, Trajectory
 from motorid.model.definition import Parameter
 from motorid.model.equations import System
 from motorid.model.model import SHOWN, Model
 from motorid.numerics.autoregression import effective_samples
 from motorid.numerics.least_squares import Huber
-from motorid.numerics.signals import Array
+from motorid.numerics.signals import Array, left_out
 from motorid.problem.runs import Run, first_width, noise_of, prepare_run, with_inputs
 from motorid.problem.unknowns import Point, Scaling, Unknowns
 from motorid.records.experiment import Experiment, between_pauses
 
 SUBSTEPS = 10  # per sample: what needs more cannot be seen in these samples, unless it is cheap
 CHEAP = 60_000  # steps of integration
+BESIDE = 8  # samples on either side that tell when a step of the voltage came
+SURELY = 16.0  # of χ² between two times: four standard deviations
 LARGEST_SLOPE = 1e100  # of an output; beyond it the numbers mean nothing
 NOISE_SHARE = 0.01  # error of an interval over the noise
 MISFIT_SHARE = 0.1  # of the misfit, where it is what the noise would be
@@ -193,9 +195,34 @@ class Problem:
         # From one step per sample on, so that the grid depends on q alone and not on the way there.
         at = self.unknowns.of_run(at, k)
         run, x0 = self.runs[k], self.unknowns.first_state(at, k)
-        coarse = run.grid.with_substeps(np.ones_like(run.grid.substeps))
+        grid = with_inputs(run, self.system.inputs).grid if run.unseen else run.grid
+        coarse = grid.with_substeps(np.ones_like(grid.substeps))
         grid = self.integrator.prepare(self.system, coarse, x0, at.p, self._tolerance(k))
+        if run.unseen:
+            return replace(run, grid=self._with_steps_placed(k, grid, x0, at.p))
         return run if np.array_equal(grid.substeps, run.grid.substeps) else replace(run, grid=grid)
+
+    def _with_steps_placed(self, k: int, grid: Grid, x0: Array, p: Array) -> Grid:
+        """Return a grid where a step of the voltage comes, as a ramp of the same mean, with that of the samples left
+        out before it is seen for which the outputs beside it surely ask: an angle keeps for ever what it did."""
+        j, n = self.system.inputs.index("v"), len(grid.t)
+        m, more, way = self.measured[k], left_out(grid.t), grid.way[:, j]
+        traj = self.integrator.run(self.system, grid, x0, p)
+        for i in self.runs[k].unseen:
+            a, b = max(i - BESIDE, 0), min(i + BESIDE, n - 1)
+            part, whole = grid.part(i, b), np.append(1.0, np.zeros(b - i - 1))
+            held, moved = (self.integrator.run(self.system, g, traj.x[i], p).y for g in (part, part.with_way(j, whole)))
+            pushed = np.vstack([np.zeros((i - a, m.y.shape[1])), (moved - held) * m.weights])
+            left = (m.y - traj.y)[a:b + 1] * m.weights
+            known = np.isfinite(left).all(axis=1)
+            drift = np.linalg.qr(np.column_stack([np.ones(known.sum()), grid.t[a:b + 1][known]]))[0]
+            left, pushed = (z[known] - drift @ (drift.T @ z[known]) for z in (left, pushed))
+            ways = 2 * np.arange(more[i] + 1) / (more[i] + 1)
+            squares = np.array([np.sum((left - w * pushed) ** 2) for w in ways])
+            best = int(squares.argmin())
+            if left.size * np.log((squares[0] + 1e-300) / (squares[best] + 1e-300)) > SURELY:
+                way[i] = ways[best]
+        return grid.with_way(j, way)
 
     def with_finer_steps(self, factor: int) -> "Problem":
         """Return the problem with `factor` times as many sub-steps everywhere."""

@@ -13,7 +13,7 @@ from motorid.channels import CHANNELS, COMPUTED_INPUTS, NAMES
 from motorid.errors import ModelError, among
 from motorid.integrate.engine import Grid
 from motorid.model.definition import Parameter
-from motorid.numerics.signals import Array, bridged, integral, noise_level, window_slopes
+from motorid.numerics.signals import Array, bridged, going_on, integral, left_out, noise_level, window_slopes
 from motorid.records.experiment import Experiment
 
 INITIAL = ("auto", "rest", "measured", "estimate")
@@ -42,6 +42,7 @@ class Run:
     limits: Mapping[str, tuple[float, float]]  # which of them are unknowns of the fit, and between which values
     # values of this run's own of parameters that are others in every run
     apart: Mapping[str, float] = field(default_factory=dict)
+    unseen: Sequence[int] = ()  # samples after which a few are left out, one of which a step of the voltage may be
 
 
 def prepare_run(run: Experiment, channels: Sequence[str], noise: Mapping[str, float], inputs: Sequence[str],
@@ -49,7 +50,9 @@ def prepare_run(run: Experiment, channels: Sequence[str], noise: Mapping[str, fl
     """Return `run` ready for a system with `inputs`."""
     sigma = {c: float(run.sigma.get(c, noise[c])) for c in channels if c in run.outputs}
     start, limits = initial_state(run, sigma, initial)
-    return Run(run, _grid(run, inputs), sigma, start, limits)
+    v, more = run.inputs["v"], left_out(run.t)
+    unseen = np.flatnonzero((more > 0) & (np.diff(v) != 0) & (going_on(run.t, v) == 0)) if run.hold == "zoh" else ()
+    return Run(run, _grid(run, inputs), sigma, start, limits, unseen=tuple(unseen))
 
 
 def with_inputs(run: Run, inputs: Sequence[str]) -> Run:
@@ -124,8 +127,7 @@ def initial_state(run: Experiment, sigma: Mapping[str, float],
     ``auto``: known zeros where nothing moves yet, otherwise estimated; a measured angle is estimated too: its first
     sample is as noisy as any, and half a count of the finest encoder shows over a long run. Estimates stay within what
     the first samples allow, so that a model which lacks something cannot hide it in an initial state that never was.
-    ``estimate``: everything, without limits.
-    """
+    ``estimate``: everything, without limits."""
     among(initial, INITIAL, "initial state")
     rest, lead = at_rest(run, sigma)
     known = rest if initial == "auto" else initial == "rest"

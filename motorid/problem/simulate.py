@@ -1,7 +1,5 @@
 """Simulating a model on records: `simulate`; judging it there: `evaluate`; and how far a problem is from its noise."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -172,8 +172,7 @@ def _the_same_twice(runs: Sequence[Experiment]) -> str | None:
 def _other_scale(runs: Sequence[Experiment]) -> str | None:
     """Compare what the speed per voltage is at least (RMS over the largest voltage) with what another's is at most.
 
-    That is its largest speed over the mean of the best tenth of its voltage, which a fast excitation makes small.
-    """
+    That is its largest speed over the mean of the best tenth of its voltage, which a fast excitation makes small."""
     gains = []
     for run in runs:
         v, omega, tenth = run.inputs["v"], _speed(run), run.n // 10
@@ -360,8 +359,7 @@ def unresolved(run: Experiment) -> str | None:
 def _unanswered(run: Experiment) -> bool:
     """Tell whether means of the voltage, where noise is small, say next to nothing of those of the speed.
 
-    A current would answer where friction or a heavy load lets no speed, and the slopes of an angle are mostly noise.
-    """
+    A current would answer where friction or a heavy load lets no speed, and the slopes of an angle are mostly noise."""
     y = bridged(run.t, run.outputs["omega"]) if {"i", "omega"} & {*run.outputs} == {"omega"} else np.empty(0)
     if len(y) < PART**2 or abs(y.mean()) > 0.5 * y.std():  # it runs by itself
         return False
@@ -386,8 +384,7 @@ def _noisy(run: Experiment) -> str | None:
 def _beside_voltage(run: Experiment, y: Array) -> float:
     """Return the standard deviation of what the voltage, now or two measurements before, does not explain of `y` (N,).
 
-    What follows a voltage that jumps with every measurement looks like noise, and is none.
-    """
+    What follows a voltage that jumps with every measurement looks like noise, and is none."""
     at = np.flatnonzero(np.isfinite(y))
     at = at[np.diff(y[at], prepend=np.nan) != 0]
     if len(at) < FEWEST_FRESH:
@@ -661,8 +658,7 @@ def _as_balances_want(run: Experiment) -> Reading:
 
     What is stated stands, unless another reading leaves less than half unexplained, see `_Balances`. Columns are called
     exchanged only where the exchange explains both balances, and the sampling resolves them: of a record with gaps or a
-    dead sensor anything explains a little more, of one sampled slowly nearly any reading explains all.
-    """
+    dead sensor anything explains a little more, of one sampled slowly nearly any reading explains all."""
     known = [c for c in ("i", "omega") if c in run.outputs and np.isfinite(run.outputs[c]).sum() > 1]
     stated: Reading = (0, 1, 2), (1, 1)
     if "omega" not in known or run.n < 30 or run.units["v"] != "V":  # a commanded torque or current obeys others

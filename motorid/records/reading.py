@@ -1,7 +1,5 @@
 """Read and write records: text tables, MATLAB, Parquet; `read_runs` is the entry."""
 
-from __future__ import annotations
-
 import glob
 import hashlib
 import os

@@ -50,6 +50,32 @@ def test_over_a_few_samples_left_out_a_voltage_goes_on_as_evenly_as_beside(shape
     np.testing.assert_allclose(y[0], fit.simulations[0].outputs["theta"], atol=1e-9 * np.ptp(whole))
 
 
+@pytest.mark.parametrize("channels", [("theta",), ("i", "omega")])
+@pytest.mark.parametrize("lost", [0, -1], ids=["step", "before"])
+def test_a_step_that_came_while_samples_were_left_out_is_where_the_outputs_ask_for_it(channels, lost, rng):
+    t = 3e-3 * np.arange(1200)
+    noise = {"theta": 0.009, "i": 0.03, "omega": 0.5}
+
+    def record(seed):
+        v = 8 * np.repeat(np.random.default_rng(seed).choice([-1.0, 0.5, 1.0], 60), 20)
+        whole = simulated(t, v, channels)
+        kept = np.setdiff1d(np.arange(1200), np.flatnonzero(np.diff(v))[4::6] + 1 + lost)
+        assert 1180 < len(kept) < 1196
+        return mi.Experiment(t[kept], {"v": v[kept]}, {
+            c: y[kept] + noise[c] * rng.standard_normal(len(kept)) for c, y in whole.outputs.items()})
+
+    fit, check = mi.fit(mi.dc_motor(), record(1)), record(2)
+    assert all(misfit < 1.15 for misfit in fit.misfit.values()), fit.misfit
+    # A ramp of the same mean stands for a step between samples: one sample of the current, after each, shows that.
+    assert all(e < 1.3 * noise[c] for c, e in mi.evaluate(fit, [check]).rmse.items() if c != "i" or lost)
+    placed = np.count_nonzero(fit.problem.runs[0].grid.way)
+    assert placed == 0 if lost else placed >= 5
+    exported = {f.name(): f for f in functions_of(fit)}
+    y = np.array(exported["simulate_0"](*(exported["record_0"]()[n] for n in "sup"))[0])
+    for c, row in zip(fit.problem.outputs, y, strict=True):
+        np.testing.assert_allclose(row, fit.simulations[0].outputs[c], atol=1e-9 * np.ptp(row))
+
+
 # -- residuals -----------------------------------------------------------------------------------------------
 def test_at_the_truth_the_residual_is_white_noise_of_size_one(runs):
     problem = as_problem(TRUE, runs)

@@ -1,8 +1,7 @@
 """A mesh as a sparse nonlinear program for IPOPT: exact first derivatives, Gauss-Newton Hessian.
 
 Wächter & Biegler, "On the implementation of an interior-point filter line-search algorithm for large-scale nonlinear
-programming", Mathematical Programming 106, 2006. The functions are callbacks, which take the compiled step.
-"""
+programming", Mathematical Programming 106, 2006. The functions are callbacks, which take the compiled step."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple

@@ -219,8 +219,7 @@ def contradiction(problem: Problem, q: Array) -> str | None:
     """Return a sentence naming the constraints that no values near keep together, and by how much; None if all can be.
 
     At the least sum of squared violations those that are left push against one another, or against the limits of
-    the parameters; the others have no part in it.
-    """
+    the parameters; the others have no part in it."""
     found = [_least_violations(problem, start) for start in (q, problem.start)]
     at = min((f for f in found if f is not None), key=lambda f: f[0], default=None)
     if at is None or at[0] < MISSED:
