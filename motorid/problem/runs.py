@@ -52,7 +52,7 @@ def prepare_run(run: Experiment, channels: Sequence[str], noise: Mapping[str, fl
     start, limits = initial_state(run, sigma, initial)
     v, more = run.inputs["v"], left_out(run.t)
     unseen = np.flatnonzero((more > 0) & (np.diff(v) != 0) & (going_on(run.t, v) == 0)) if run.hold == "zoh" else ()
-    return Run(run, _grid(run, inputs), sigma, start, limits, unseen=tuple(unseen))
+    return Run(run, _grid(run, inputs), sigma, start, limits, unseen=tuple(map(int, unseen)))
 
 
 def with_inputs(run: Run, inputs: Sequence[str]) -> Run:
