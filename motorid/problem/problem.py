@@ -198,9 +198,9 @@ class Problem:
         grid = with_inputs(run, self.system.inputs).grid if run.unseen else run.grid
         coarse = grid.with_substeps(np.ones_like(grid.substeps))
         grid = self.integrator.prepare(self.system, coarse, x0, at.p, self._tolerance(k))
-        if run.unseen:
-            return replace(run, grid=self._with_steps_placed(k, grid, x0, at.p))
-        return run if np.array_equal(grid.substeps, run.grid.substeps) else replace(run, grid=grid)
+        grid = self._with_steps_placed(k, grid, x0, at.p) if run.unseen else grid
+        same = np.array_equal(grid.substeps, run.grid.substeps) and np.array_equal(grid.u1, run.grid.u1)
+        return run if same else replace(run, grid=grid)
 
     def _with_steps_placed(self, k: int, grid: Grid, x0: Array, p: Array) -> Grid:
         """Return a grid where a step of the voltage comes, as a ramp of the same mean, with that of the samples left
@@ -213,7 +213,7 @@ class Problem:
             part, whole = grid.part(i, b), np.append(1.0, np.zeros(b - i - 1))
             held, moved = (self.integrator.run(self.system, g, traj.x[i], p).y for g in (part, part.with_way(j, whole)))
             pushed = np.vstack([np.zeros((i - a, m.y.shape[1])), (moved - held) * m.weights])
-            left = (m.y - traj.y)[a:b + 1] * m.weights
+            left = np.where(m.weights > 0, (m.y - traj.y)[a:b + 1] * m.weights, 0.0)
             known = np.isfinite(left).all(axis=1)
             drift = np.linalg.qr(np.column_stack([np.ones(known.sum()), grid.t[a:b + 1][known]]))[0]
             left, pushed = (z[known] - drift @ (drift.T @ z[known]) for z in (left, pushed))

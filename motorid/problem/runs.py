@@ -50,8 +50,8 @@ def prepare_run(run: Experiment, channels: Sequence[str], noise: Mapping[str, fl
     """Return `run` ready for a system with `inputs`."""
     sigma = {c: float(run.sigma.get(c, noise[c])) for c in channels if c in run.outputs}
     start, limits = initial_state(run, sigma, initial)
-    v, more = run.inputs["v"], left_out(run.t)
-    unseen = np.flatnonzero((more > 0) & (np.diff(v) != 0) & (going_on(run.t, v) == 0)) if run.hold == "zoh" else ()
+    v, more = run.inputs["v"], left_out(run.t) * (run.hold == "zoh")
+    unseen = np.flatnonzero((more > 0) & (np.abs(np.diff(v)) > OFF * np.abs(v).max()) & (going_on(run.t, v) == 0))
     return Run(run, _grid(run, inputs), sigma, start, limits, unseen=tuple(map(int, unseen)))
 
 
