@@ -168,6 +168,7 @@ def arguments_told(thing: _Thing) -> _Thing:
     return cast(_Thing, call)
 
 
+@functools.cache
 def _named(annotation: Any) -> Any:
     """Return an annotation as it is written, without the modules of what it names."""
     if isinstance(annotation, type) or annotation is None:
