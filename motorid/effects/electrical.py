@@ -92,7 +92,7 @@ def driver_coast(m: Equations, R_c=P(50.0, "Ω", null=0.0, positive=True, grid=(
 
 
 @effect(balance="voltage")
-def driver_one_quadrant(m: Equations, R_q=P(1e3, "Ω", null=0.0, positive=True, grid=(30.0, 1e3),
+def driver_one_quadrant(m: Equations, R_q=P(50.0, "Ω", null=0.0, positive=True, grid=(3.0, 30.0),
                                             doc="resistance against a current that the drive does not carry")):
     """One-quadrant drive: no current but along the command. Mohan et al., Power Electronics, 2003, ch. 7.
 
