@@ -91,7 +91,7 @@ def driver_coast(m: Equations, R_c=P(50.0, "Ω", null=0.0, positive=True, grid=(
     m.voltage -= ca.if_else(ca.fabs(m.command) <= OPEN, R_c * m.i - (1 - shorted) * m.K_e * m.omega, 0)
 
 
-@effect(balance="voltage")
+@effect(balance="voltage", includes=("driver_coast",))
 def driver_one_quadrant(m: Equations, R_q=P(50.0, "Ω", null=0.0, positive=True, grid=(3.0, 30.0),
                                             doc="resistance against a current that the drive does not carry")):
     """One-quadrant drive: no current but along the command. Mohan et al., Power Electronics, 2003, ch. 7.

@@ -47,7 +47,7 @@ class Grid:
         """Return the grid with other sub-steps."""
         return replace(self, substeps=np.ascontiguousarray(substeps, np.int64))
 
-    @property
+    @cached_property
     def way(self) -> Array:
         """Shares of their change to the next sample that the inputs do before that, evenly, (N-1, nu)."""
         change = np.diff(self.u, axis=0)

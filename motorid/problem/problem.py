@@ -206,7 +206,7 @@ class Problem:
         """Return a grid where a step of the voltage comes, as a ramp of the same mean, with that of the samples left
         out before it is seen for which the outputs beside it surely ask: an angle keeps for ever what it did."""
         j, n = self.system.inputs.index("v"), len(grid.t)
-        m, more, way = self.measured[k], left_out(grid.t), grid.way[:, j]
+        m, more, way = self.measured[k], left_out(grid.t), grid.way[:, j].copy()
         traj = self.integrator.run(self.system, grid, x0, p)
         for i in self.runs[k].unseen:
             a, b = max(i - BESIDE, 0), min(i + BESIDE, n - 1)

@@ -150,3 +150,10 @@ def test_what_does_as_well_as_the_first_effect_alone_is_no_rival_once_the_second
     assert found.groups == ()
     assert found.rivals == (found.best,)
     assert rival not in found.text
+
+
+def test_a_bridge_that_opens_at_zero_alone_is_no_one_quadrant_drive():
+    """The wider law does the same there; on a tie the smaller one is told."""
+    runs, check = battery.CASES["driver_coast"].records()
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), check, effects=("driver_coast", "driver_one_quadrant"))
+    assert (found.effects, found.groups) == (("driver_coast",), ())
