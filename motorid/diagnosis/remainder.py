@@ -8,7 +8,8 @@ many on a grid. Where one curve leaves what another predicts, there are several,
 
 import contextlib
 import re
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial, reduce
 from itertools import chain, islice, takewhile
@@ -49,7 +50,7 @@ ROUNDS = 3  # of choosing functions and fitting: near the optimum slopes show wh
 CLEAN = 1.05  # times the noise, of which no more is known than that: what leaves less cannot be told from the law
 TASTED = 2  # functions by which forms are compared, and
 AHEAD = 2  # how many then go on, of those in short windows one
-_moments = partial(over_moments, solve=partial(solve, solver=QUICK))  # a model that is far off, in short windows
+_known: ContextVar[dict[Any, Any]] = ContextVar("what a search for a curve found until it was stopped")
 AT_ONCE = 20  # parts of a sample, in one of which follows what does so at once; more are too stiff to fit,
 INPUT_AT_ONCE = 80  # but not of an input, which jumps at samples only
 QUANTITIES = {"run": "0.0", "turn": "m.theta",
@@ -361,7 +362,9 @@ class Curve:
     def refitted(self, last: Fit, *starts: Mapping[str, float]) -> "Curve | None":
         """Return the curve fitted with the model, from `starts` beside the `last` values or not; None if that fails, or
         only tells the measured angle to follow itself."""
-        done = refit(last, self.fit.model + self.effect, [{**w, **s} for s in starts for w in (last.values, {})])
+        model, every = self.fit.model + self.effect, [{**w, **s} for s in starts for w in (last.values, {})]
+        key = last, self.fit, self.law, *(tuple(start.items()) for start in every)
+        done = _once(lambda: refit(last, model, every), *key)
         if done is None or copies_the_angle(done.problem, done.q):
             return None
         return replace(self, values=tuple(done.values[n] for n in self.sizes), fitted=done)
@@ -386,6 +389,10 @@ class Remainder:
     # effects that only approximate the rest, with the form that predicts better in their place, if one does
     _approximating: Mapping[str, Form | None] = field(default_factory=dict, repr=False)
     _records: Sequence[Experiment] = field(default=(), repr=False)  # of which the fit may be of parts
+    _stopped: dict[Any, Any] = field(default_factory=dict, repr=False)  # what a search found that is to go on
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_stopped": {}}  # many fits, that are found again
 
     @property
     def form(self) -> Form | None:
@@ -450,21 +457,25 @@ class Remainder:
         if self.kind != "structure":
             raise UsageError(f"the remainder is {self.kind}: nothing is left that a curve over a quantity predicts.")
         with contextlib.suppress(OutOfTime):
-            if self._best is not None:
-                return self._best.curve
+            if (best := self._best) is not None:
+                self._stopped.clear()
+                return best.curve
         raise UsageError("something predictable is left, but no curve over one quantity lowers the error on data "
                          "left out; do these hold voltages or speeds that others lack?")
 
     @cached_property
     def _best(self) -> "Grown | None":
         """The same, with what it predicts; None where none helps. Raises OutOfTime before there is any."""
-        best = None
-        with budget(SECONDS), looked_at():
-            with contextlib.suppress(OutOfTime), budget(SECONDS / 2):  # they may be many times as long
-                best = (whole := self._on_whole) and whole._grown
-            if (best := best or self._grown) is None:
-                check_time()
-        return best
+        best, token = None, _known.set(self._stopped)
+        try:
+            with budget(SECONDS), looked_at():
+                with contextlib.suppress(OutOfTime), budget(SECONDS / 2):  # they may be many times as long
+                    best = (whole := self._on_whole) and whole._grown
+                if (best := best or self._grown) is None:
+                    check_time()
+            return best
+        finally:
+            _known.reset(token)
 
     def led_by_its_curve(self) -> "Remainder":
         """Return the same with the forms of its curve first, or none where no curve helps. Raises OutOfTime."""
@@ -475,6 +486,7 @@ class Remainder:
         with contextlib.suppress(OutOfTime):
             check_time()
             found.__dict__["_best"] = best  # to its end: `as_effect` may take longer than a diagnosis does
+            self._stopped.clear()
         return found
 
     @property
@@ -486,7 +498,7 @@ class Remainder:
     @property
     def _grown(self) -> "Grown | None":
         """The same, as far as it has grown; None where none helps. Raises OutOfTime before there is any."""
-        short = (t for root in [self._root or self.fit] for t in _grown_in(_moments(root), root, self.forms))
+        short = (t for root in [self._root or self.fit] for t in _grown_in(_in_windows(root), root, self.forms))
         every = _by_turns(*(islice(some, TRIED) for some in (self._tried(), short, *map(_beyond, self._anew))))
         return _predicting_most(self.fit, every, self._held or HeldOut.of(self.fit, None))
 
@@ -495,8 +507,8 @@ class Remainder:
         """The same on whole `_records`, where the fit is of parts: what was before each is not known there."""
         if not (runs := whole_of(self.fit, self._records)):
             return None
-        fit, root = fitted_to(self.fit, runs, QUICK), self._root and fitted_to(self._root, runs, QUICK)
-        return replace(self, fit=fit, _root=root, forms=misspecification.in_turn(better_forms(fit, fit)), _records=())
+        fit, root = (f and _once(partial(fitted_to, f, runs, QUICK), f, "whole") for f in (self.fit, self._root))
+        return replace(self, fit=fit, _root=root, forms=misspecification.in_turn(_forms_beside(fit)), _records=())
 
     def _tried(self) -> Iterator[tuple[Curve, Form]]:
         """Yield models and a form to fit with each, the likeliest first; what takes a fit to find only when asked for.
@@ -522,13 +534,31 @@ class Remainder:
         return (self._root,) if zeroed is None else (zeroed, self._root)
 
 
+def _once(find: Callable[[], Any], *key: Any) -> Any:
+    """Return what a search that was stopped, and goes on, had found by this key, or what it finds now."""
+    known = _known.get({})
+    if key not in known:
+        known[key] = find()
+    return known[key]
+
+
+def _forms_beside(fit: Fit) -> list[FormGain]:
+    return list(_once(lambda: better_forms(fit, fit), fit, "forms"))
+
+
+def _in_windows(fit: Fit) -> Fit | None:
+    """Return a model that is far off, fitted in short windows."""
+    found: Fit | None = _once(lambda: over_moments(fit, solve=partial(solve, solver=QUICK)), fit, "windows")
+    return found
+
+
 def _without(fit: Fit, names: Iterable[str]) -> Fit | None:
     """Return the fit without these effects, but for every run's own zero of the angle; None where there is none."""
     with contextlib.suppress(ModelError):
         zeros = {e.name for e in fit.model.effects if tells_the_zero(e)}
         model = reduce(Model.without, (n for n in names if n not in zeros), fit.model)
         values = {n: v for n, v in fit.values.items() if n in model.parameters}
-        return None if model is fit.model else refit(fit, model, (values,))
+        return None if model is fit.model else _once(lambda: refit(fit, model, (values,)), fit, model.effect_names)
     return None
 
 
@@ -544,7 +574,7 @@ def _beyond(base: Fit | None) -> Iterator[tuple[Curve, Form]]:
     """Yield a model, without a curve yet, with each form that predicts more than it does, the best first."""
     if base is not None:
         with contextlib.suppress(*FAILURES):
-            yield from _over_zeros(base, misspecification.in_turn(better_forms(base, base)))
+            yield from _over_zeros(base, misspecification.in_turn(_forms_beside(base)))
 
 
 def _over_zeros(base: Fit, forms: Iterable[Form]) -> Iterator[tuple[Curve, Form]]:
@@ -557,7 +587,8 @@ def _over_zeros(base: Fit, forms: Iterable[Form]) -> Iterator[tuple[Curve, Form]
 def _zeroed(base: Fit, zeros: Mapping[str, float]) -> Fit | None:
     """Return a fit with the zero of the angle of every run, beginning at `zeros`; what has one is that already."""
     known = any(map(tells_the_zero, base.model.effects))
-    return base if known else refit(base, base.model + PER_RUN["encoder_zero"], [zeros])
+    return base if known else _once(
+        lambda: refit(base, base.model + PER_RUN["encoder_zero"], [zeros]), base, *zeros.items())
 
 
 def _grown_in(there: Fit | None, base: Fit, asked: Sequence[Form]) -> Iterator[tuple[Curve, Form]]:
@@ -694,7 +725,7 @@ def alone_predicting_more(last: Node, root: Fit, held: HeldOut, forms: Sequence[
     found = dict[Any, Grown]()
     check_time()
     with contextlib.suppress(*FAILURES):
-        _race(found, islice(_grown_in(_moments(root), root, forms), AHEAD), held.predictions(root), held, True)
+        _race(found, islice(_grown_in(_in_windows(root), root, forms), AHEAD), held.predictions(root), held, True)
     gains = (FormGain(key[1], compare(last.predictions, f.predictions), f.predictions) for key, f in found.items())
     return next((gain for gain in gains if gain.evidence.worth_it), None)
 
@@ -748,7 +779,8 @@ def _growing(curve: Curve, form: Form, moved: bool, before: Predictions, held: H
         curve = replace(curve, parts=(*curve.parts, Part.of(curve.fitted or curve.fit, form, moved)))
         for _ in range(FEW if moved else ROUNDS):
             check_time()
-            larger, led = led or curve.grown(), None
+            known = curve.fitted or curve.fit, curve.fit, curve.values, curve.name, curve.trial, form, moved
+            larger, led = led or _once(curve.grown, *known), None
             if larger is None or larger.fitted is None:
                 return
             predicted = held.predictions(larger.fitted)

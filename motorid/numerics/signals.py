@@ -15,6 +15,7 @@ _FLOOR = 1e-5  # of the channel's own variation: what a noise-free simulation is
 FEWEST_FRESH = 20  # measurements of a sensor that is read more often than it measures
 MOST_HELD = 64  # samples for which a sensor is looked at as one that holds its value
 HELD = 30.0  # times the noise that its changes are, squared: 130 and more in a trial, 12 at most in 870 other channels
+COARSE = 0.01  # of the interval: rounding of time stamps that matters; of that rounding: what is none
 _EVEN = 1e-6  # of the interval: samples are evenly spaced if their times wander by less
 _FEW, _MOSTLY = 512, 0.8  # jumps of a first look at a step, and the share of them that must be its multiples
 _REST = 12  # equal samples in a row that count as standstill
@@ -92,6 +93,20 @@ def quantum(y: ArrayLike) -> float:
         if np.mean((np.abs(steps - steps.round()) < 0.1) & ((steps > 0.5) | (jumps < rounded))) > 0.95:
             return step  # beside a few glitches, too, all else is far less than one, and yet no rounding
     return 0.0
+
+
+def unrounded(t: Array) -> tuple[Array, float]:
+    """Return stamps (N,) of even samples, some left out, as they were before they were rounded, and to how much that
+    was; stamps that wander by more than rounding does, or are as good as even, as they are, and 0.0."""
+    steps = np.diff(t)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    apart = np.diff(np.unique(steps))
+    step = float(apart[apart > COARSE * usual].min(initial=np.inf))
+    if not step < usual or (np.abs(steps / step - np.rint(steps / step)) > COARSE).any():
+        return t, 0.0
+    number = np.concatenate([[0.0], np.cumsum(np.rint(steps / steps[steps < 1.5 * usual].mean()))])
+    even = np.polynomial.Polynomial.fit(number, t, 1)(number)
+    return (even, step) if COARSE < np.ptp(t - even) / step < 1.1 else (t, 0.0)  # a line through few is not exact
 
 
 def left_out(t: Array) -> NDArray[np.intp]:

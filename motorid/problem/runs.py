@@ -150,8 +150,8 @@ def initial_state(run: Experiment, sigma: Mapping[str, float],
             start[1], reach["omega"] = speed, max(far, abs(speed)) if _may_rest(run, sigma, _lead(run)) else far
         elif (apart := abs(speed - start[1])) > far:  # the sensors may disagree, by an offset
             reach["omega"] = max(reach["omega"], apart + far)
-    if "i" not in run.outputs and not known:
-        reach["i"] = np.inf  # to assume none would be a measurement that was never made
+    if not known:  # to assume none would be a measurement that was never made
+        reach |= {c: np.inf for c, shown in (("i", {"i"}), ("omega", {"omega", "theta"})) if not shown & {*run.outputs}}
     if initial in ("rest", "measured"):
         return start, {}
     if initial == "estimate":

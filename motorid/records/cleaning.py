@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from motorid.display.numbers import counted
 from motorid.errors import DataError, otherwise
-from motorid.numerics.signals import Array, fresh_means, going_on, repeats
+from motorid.numerics.signals import Array, fresh_means, going_on, repeats, unrounded
 from motorid.records.experiment import INPUTS, MIN_SAMPLES, PARTS, Experiment, pauses
 from motorid.records.layout import Layout, Place
 from motorid.records.preprocessing import unwrapped
@@ -47,6 +47,7 @@ def run_from_columns(columns: Mapping[str, Array], texts: Texts, layout: Layout,
         raise DataError(f"every sample of {', '.join(repr(places[c].column) for c in values if c not in INPUTS)} is "
                         "missing; there is nothing measured to fit.")
     for part in np.split(np.arange(len(t)), np.searchsorted(t, begun)):
+        t[part] = _unrounded(t[part], layout.places["t"].column, said)
         _note_gaps(t[part], said)
         if "theta" in outputs and places["theta"].unit.symbol == "rad":
             measured = {c: y[part] for c, y in outputs.items()}
@@ -142,6 +143,14 @@ def _dates(cells: Sequence[object], column: str) -> Array:
                 return np.unwrap(seconds, period=86400.0) if np.isfinite(seconds).all() else seconds  # past midnight
     raise DataError(f"the time column '{column}' holds neither numbers nor dates, e.g. '{str(cells[0])[:40]}'; "
                     "expected seconds, or another unit that is stated. Samples a fixed time apart: dt=0.001.")
+
+
+def _unrounded(t: Array, column: str, said: list[str]) -> Array:
+    """Return time stamps that are even but for their rounding as they were before it."""
+    found, step = unrounded(t)
+    said += [f"the stamps of '{column}' are rounded to {1e3 * step:.3g} ms; their samples are as even as that allows, "
+             f"{1e3 * np.median(np.diff(found)):.4g} ms apart, and are taken to be."] * bool(step)
+    return found
 
 
 def _rows_in_order(t: Array, column: str, said: list[str]) -> tuple[NDArray[np.intp], Array, list[float]]:

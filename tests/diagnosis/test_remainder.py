@@ -42,6 +42,7 @@ from motorid.diagnosis.remainder import Curve, Part, Remainder
 from motorid.errors import OutOfTime
 from motorid.estimation.fit import over_moments, solve
 from motorid.exporters.export import load
+from motorid.numerics import parallel
 from motorid.numerics.parallel import budget, one_thread
 from motorid.records.experiment import record_of, windows
 from motorid.records.reading import write_csv
@@ -934,6 +935,28 @@ def test_where_nothing_is_named_the_curve_leads_if_there_is_time(lab, monkeypatc
     by_slopes = found()
     assert by_slopes.remainder.follows == "an error of the angle sensor that changes with the angle"
     assert "With that as a curve" not in by_slopes.answer
+
+
+def test_a_search_that_was_stopped_goes_on_from_there(lab, monkeypatch):
+    """What a diagnosis found of a curve until its time was up is not found again by `as_effect`."""
+    runs, _ = _with_law(slack_pinion, ANGLE[::2], lab)
+    fit = mi.fit(mi.dc_motor(), runs[:2])
+    forms, clock, whole = grades.in_turn(grades.better_forms(fit, fit)), [0.0], remainder.refit
+
+    def counted(*args):
+        clock[0] += 1e-3
+        return whole(*args)
+
+    monkeypatch.setattr(parallel, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    monkeypatch.setattr(remainder, "refit", counted)
+    alone = Remainder("structure", fit, forms).as_effect()
+    fits, left = clock[0], Remainder("structure", fit, forms)
+    with pytest.raises(OutOfTime), budget(fits / 2):
+        left.led_by_its_curve()
+    assert clock[0] < 2 * fits
+    assert left.as_effect().parameters == alone.parameters
+    assert clock[0] == pytest.approx(2 * fits, abs=1.5e-3)  # what was being fitted just then is begun anew
+    assert not left._stopped  # nor kept when it is done
 
 
 def test_what_happened_before_a_part_of_a_record_shows_on_whole_ones(lab, monkeypatch):

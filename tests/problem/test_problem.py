@@ -255,6 +255,19 @@ def test_the_speed_at_the_start_may_come_from_the_angle_alone(rng):
     )
 
 
+def test_the_speed_at_the_start_is_estimated_where_the_current_alone_is_measured(rng):
+    """Taken to be none, a plain motor's current was 19 times its noise away."""
+    run = moving(rng, ("i",))
+    assert [p.name for p in as_problem(TRUE, run).unknown[5:]] == ["i_0[0]", "omega_0[0]"]
+    fit = mi.fit(mi.dc_motor(K=VALUES["K"]).fix("K"), run)
+    assert fit.misfit["i"] < 1.05
+    t = np.arange(800) * 1e-3
+    true = simulated(t, drive(t, 6.0)).outputs["omega"][300]
+    assert fit.initial["omega_0[0]"] == pytest.approx(true, rel=0.05)
+    still = simulated(t, drive(t, 6.0), ("i",))
+    assert [p.name for p in as_problem(TRUE, still).unknown] == list(VALUES)  # one that begins at rest does so
+
+
 def test_a_first_current_that_was_not_measured_accelerates_no_more_than_the_records_show(rng):
     """With next to no inductance 189 A through a megohm were but a kick at the start, which hid the inductance."""
     run = moving(rng, ("omega",))

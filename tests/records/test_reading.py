@@ -406,6 +406,26 @@ def test_time_is_put_in_order_and_every_loss_is_told(t, dropped, note, tmp_path)
     assert note in notes(run)
 
 
+@pytest.mark.parametrize(("dt", "left_out"), [(2.62, ()), (1.6, ()), (12.5, (7, 8, 100)), (33.3, ())])
+def test_stamps_that_are_even_but_for_their_rounding_are_taken_to_be(dt, left_out, tmp_path):
+    """At 2.6 ms whole milliseconds are 2 or 3 ms apart: what a plain motor does per stamp wanders by a third."""
+    k = np.delete(np.arange(400), left_out)
+    stamps = [f"{s:.0f}" for s in np.round(dt * k)]
+    run = read_csv(write(tmp_path, table(stamps, [1] * len(k), k).replace("t_s", "t_ms")))
+    np.testing.assert_allclose(np.diff(run.t), 1e-3 * dt * np.diff(k), rtol=1e-3)
+    assert abs(run.t - 1e-3 * dt * k).max() < 0.6e-3
+    assert "the stamps of 't_ms' are rounded to 1 ms" in notes(run)
+    assert f"{np.median(np.diff(run.t)) * 1e3:.4g} ms apart" in notes(run)
+
+
+@pytest.mark.parametrize("steps", [(2, 3, 3, 2, 9, 2, 3, 5), (4, 4, 7, 4), (5,), (1000, 1001), (10, 10, 3010)])
+def test_stamps_that_wander_by_more_or_hardly_are_left_as_they_are(steps, tmp_path):
+    stamps = np.cumsum([0, *steps * 40])
+    run = read_csv(write(tmp_path, table(stamps, [1] * len(stamps), range(len(stamps))).replace("t_s", "t_ms")))
+    np.testing.assert_array_equal(run.t, stamps * 1e-3)
+    assert "rounded" not in notes(run)
+
+
 def test_a_time_that_starts_again_begins_another_run(tmp_path):
     """A logger that appends, and counts turns modulo one anew; too few rows are no run."""
     counts = [*range(60), *range(100, 150), *range(30, 33), *range(9)]
