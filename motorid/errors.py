@@ -130,8 +130,7 @@ def arguments_told(thing: _Thing) -> _Thing:
     """Let a function, or what a class is made with and its methods, say which argument is not what its annotation says.
 
     Numbers, words, flags and lists of them are looked at in any case: many a wrong one does its harm without an error.
-    All others only where the call fails, so that nothing that works is refused. What a class says itself goes first.
-    """
+    All others only where the call fails, so that nothing that works is refused. What a class says itself goes first."""
     if isinstance(thing, type):
         for name, member in list(vars(thing).items()):
             if inspect.isfunction(member) and (name in ("__init__", "__add__", "__call__") or not name.startswith("_")):

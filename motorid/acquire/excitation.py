@@ -13,8 +13,7 @@ hang on the computer. Words are joined by commas, numbers by colons, in V, s and
     standard                      steps, stairs, a ramp and a PRBS within 0.6 of the voltage limit, 8.2 s
 
 On the line a segment is ``R,<ms>,<mV from>,<mV to>``, ``C,<ms>,<mV offset>,<mV amplitude>,<mHz from>,<mHz to>`` or
-``P,<ms>,<mV offset>,<mV amplitude>,<µs per bit>,<seed>``, all whole, so device and computer mean the same program.
-"""
+``P,<ms>,<mV offset>,<mV amplitude>,<µs per bit>,<seed>``, all whole, so device and computer mean the same program."""
 
 import math
 from dataclasses import dataclass

@@ -25,8 +25,7 @@ From the computer
     segment of the excitation (see `motorid.acquire.excitation`) · ``G,<segments>`` go, once per ``L`` · ``X``
     stop · ``K`` still here; a device at rest answers it with its last ``E,done``.
 
-A device that hears no valid frame for one second switches the motor off. A command may be repeated without harm.
-"""
+A device that hears no valid frame for one second switches the motor off. A command may be repeated without harm."""
 
 import math
 import re

@@ -18,8 +18,7 @@ def motorid(context: typer.Context,
             version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False) -> None:
     """Identify brushed DC motors: fit a model to records, see where it fails, add the effect that is missing.
 
-    Start with: motorid demo
-    """
+    Start with: motorid demo"""
     if version:
         typer.echo(f"motorid {package_version('motorid')}")
     elif context.invoked_subcommand is None:

@@ -59,8 +59,7 @@ def record_command(port: Port, out: Out, baud: Baud = 115_200, excite: Excite = 
 
     Ctrl-C stops the motor and keeps the data. Limits are checked here and enforced by the device.
 
-    Example: motorid record --port /dev/ttyACM0 --out run.csv --excite standard --limit-voltage 9
-    """
+    Example: motorid record --port /dev/ttyACM0 --out run.csv --excite standard --limit-voltage 9"""
     with _live(quiet) as progress:
         try:
             volts, amperes = (math.inf if limit is None else limit for limit in (limit_voltage, limit_current))
@@ -115,8 +114,7 @@ def bench_command(effect: HiddenEffect = "random", motor: MotorName = "lab", see
 
     --drop, --garbage, --cut and --flip are probabilities, per line, of faults on the wire.
 
-    Example: motorid bench --effect random --seed 7 --reveal
-    """
+    Example: motorid bench --effect random --seed 7 --reveal"""
     for name, value in (("speed", speed), ("unplug-after", unplug_after), ("plug-after", plug_after)):
         if value is not None and not 0 <= value < math.inf:
             raise UsageError(f"--{name} takes a number that is finite and not negative; got {value:g}.")

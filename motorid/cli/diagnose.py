@@ -64,8 +64,7 @@ def diagnose_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Vali
                      jobs: opt.Jobs = 1, json: opt.Json = None, report: opt.Report = None) -> None:
     """Say where the model fails, which physical effect is missing, and what the error is with it.
 
-    Example: motorid diagnose run*.csv --validate check*.csv --report found.html
-    """
+    Example: motorid diagnose run*.csv --validate check*.csv --report found.html"""
     records = options.read(runs)
     held_out = options.read(validate) if validate else []
     notes = options.notes(records, held_out)
@@ -154,8 +153,7 @@ def design_command(found_json: Found, out: Plan = None, goal: Goal = None, param
 
     Limits are by default the largest values of the records; nothing is played.
 
-    Example: motorid design found.json --limit-current 5 --duration 4 --out plan.csv
-    """
+    Example: motorid design found.json --limit-current 5 --duration 4 --out plan.csv"""
     rivals = read_rivals(found_json, effects_from, goal)
     design = design_experiment(
         rivals, goal=goal, parameters=parameters.replace(" ", "").split(",") if parameters else None,
@@ -188,8 +186,7 @@ def read_rivals(path: Path, effects_from: Path | None, goal: str | None) -> list
 def demo_command(out: DemoFolder = Path("motorid-demo"), json: opt.Json = None, force: opt.Force = False) -> None:
     """Show the story on shipped records: fit, see that it fails, add what is missing, see the error fall.
 
-    Example: motorid demo --out demo
-    """
+    Example: motorid demo --out demo"""
     opt.make_folder(out)
     runs, check = (read_runs(str(data_path(DEMO_SET) / pattern)) for pattern in ("run*.csv", "check*.csv"))
     show(f"1. Records: {len(runs)} of a motor ({data_path(DEMO_SET)}), and one held out that no fit will see.\n",

@@ -47,8 +47,7 @@ def fit_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Validate 
                 report: opt.Report = None) -> None:
     """Fit a motor model to records, and say how far the numbers can be trusted.
 
-    Example: motorid fit run*.csv --effects coulomb --validate check*.csv --json fit.json
-    """
+    Example: motorid fit run*.csv --effects coulomb --validate check*.csv --json fit.json"""
     records = options.read(runs)
     held_out = options.read(validate) if validate else []
     notes = [*filter(None, [repeated(records, held_out)]), *options.notes(records, held_out)]
@@ -97,8 +96,7 @@ def fit_many_command(directories: Motors, options: opt.FitOptions, out: MotorTab
 
     Names of motors begin with their folder where several are given.
 
-    Example: motorid fit-many motors/ --effects coulomb --out table.csv
-    """
+    Example: motorid fit-many motors/ --effects coulomb --out table.csv"""
     motors: dict[str, Any] = {f"{place.name}/{name}" if len(directories) > 1 else name: files
                               for place in directories for name, files in motors_in(place).items()}
     known = (records for files in motors.values() if (records := _readable(options, files)))
@@ -125,8 +123,7 @@ def _readable(options: opt.FitOptions, files: list[Path]) -> list[Any]:
 def check_command(runs: opt.Runs, options: opt.DriveOptions, json: opt.Json = None) -> None:
     """Show how records are read, column by column, and what looks wrong with them, before any fit.
 
-    Example: motorid check run*.csv
-    """
+    Example: motorid check run*.csv"""
     records = options.read(runs)
     notes = options.notes(records)
     if json:
@@ -156,8 +153,7 @@ def _channel_table(run: Experiment) -> Table:
 def effects_command(name: EffectName = None, effects_from: opt.EffectsFrom = None) -> None:
     """List the effects of the library, or show one: its law, its parameters, its source.
 
-    Example: motorid effects stribeck
-    """
+    Example: motorid effects stribeck"""
     own = opt.own_effects(effects_from) if effects_from else {}
     if name is not None:
         show(str(opt.named_effect(name, own).card()), f"\nAdd it: motorid fit RUN... --effects {name}")
@@ -173,8 +169,7 @@ def simulate_command(fit_json: SavedModel, runs: opt.Runs, options: opt.ReadingO
                      json: opt.Json = None) -> None:
     """Simulate a fitted model on records, and compare where something was measured.
 
-    Example: motorid simulate fit.json check*.csv --out simulated
-    """
+    Example: motorid simulate fit.json check*.csv --out simulated"""
     model = opt.saved_model(fit_json, effects_from)
     records = options.read(runs)
     judged = evaluate(model, records, engine=engine)
@@ -204,8 +199,7 @@ def export_command(fit_json: SavedModel, path: Target, to: Form = None, effects_
                    force: opt.Force = False) -> None:
     """Take a fitted model along: as CasADi functions, as C source, as JSON.
 
-    Example: motorid export fit.json --to c motor.c
-    """
+    Example: motorid export fit.json --to c motor.c"""
     if to is not None:
         among(to, FORMS.values(), "form", where="--to: ")
     model = opt.saved_model(fit_json, effects_from)
@@ -219,8 +213,7 @@ def identifiability_command(runs: opt.Runs, options: opt.FitOptions, json: opt.J
                             report: opt.Report = None) -> None:
     """Say which parameters, and which combinations of them, the records determine.
 
-    Example: motorid identifiability run*.csv --effects coulomb
-    """
+    Example: motorid identifiability run*.csv --effects coulomb"""
     fitted = options.fit(options.read(runs))
     found = identifiability(fitted)
     _give(found, json, options.force)
@@ -232,8 +225,7 @@ def robustness_command(runs: opt.Runs, options: opt.FitOptions, starts: Starts =
                        seed: Seed = 0, json: opt.Json = None, report: opt.Report = None) -> None:
     """Fit from many poor starts, and say whether all end in the same place.
 
-    Example: motorid robustness run*.csv --starts 50 --spread 10
-    """
+    Example: motorid robustness run*.csv --starts 50 --spread 10"""
     fitted = options.fit(options.read(runs))
     found = multistart(fitted, starts=starts, spread=spread, seed=seed)
     _give(found, json, options.force)

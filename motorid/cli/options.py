@@ -1,8 +1,7 @@
 """The options that commands have in common, and what they become: records, a model, a fit.
 
 `FitOptions` holds those of every command that fits, `ReadingOptions` those of every command that reads records;
-`with_options` puts them on a command. Below them: effects and models from the user's files.
-"""
+`with_options` puts them on a command. Below them: effects and models from the user's files."""
 
 import functools
 import importlib.util

@@ -25,8 +25,7 @@ class Node:
     """One model in the search: its fit, and what it predicts of data that it was not fitted to.
 
     `objection` says why its last effect is not the thing itself, whatever it predicts: a wrong sign, a shape at its
-    limit; empty if it may be. `reason` says what it gained on its parent.
-    """
+    limit; empty if it may be. `reason` says what it gained on its parent."""
 
     fit: Fit
     added: str | None

@@ -39,8 +39,7 @@ class Score:
     would be worth with the effect taken out: what a misfit makes smooth is no evidence of coloured noise; 0 where it
     does not matter, since the effect takes away less than one. `stands_out` says that its order is a line in the
     spectrum of the misfit, however small beside the rest of it. `same_as` are the parameters that together do what the
-    effect does, if these data cannot tell it from them. `shapes` are what it was scored by, the best first.
-    """
+    effect does, if these data cannot tell it from them. `shapes` are what it was scored by, the best first."""
 
     effect: Effect
     drop: float

@@ -46,8 +46,7 @@ class Climb:
 
     `forms` are the free forms that predict better beside all effects, the best first; `grades` are of the effects.
     `rivals` are the last model, and what it is with the others of the first group.
-    `stopped` says why it ended before it was done, if it did; `misread` is the reading for which it was left.
-    """
+    `stopped` says why it ended before it was done, if it did; `misread` is the reading for which it was left."""
 
     search: Search
     path: tuple[Node, ...]

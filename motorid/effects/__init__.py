@@ -2,8 +2,7 @@
 
 Every effect that a module here defines is in it: a new one is a function there, and nothing else. Those called
 ``measured_…`` are for records in which a supply voltage, a load torque or a temperature was measured too; a diagnosis
-tries ``other_R``, ``other_L``, ``other_K``, ``other_b`` or ``other_J`` where the user fixed that parameter.
-"""
+tries ``other_R``, ``other_L``, ``other_K``, ``other_b`` or ``other_J`` where the user fixed that parameter."""
 
 from dataclasses import dataclass
 from typing import Any

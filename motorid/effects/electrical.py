@@ -24,8 +24,7 @@ def winding_heating(m: Equations,
     """Heating of the winding, R(1+αΔT). Kirtley, Electric Power Principles, 2010.
 
     ``C_th dΔT/dt = R(1+αΔT) i² − ΔT/R_th``, ΔT = 0 at the start of each run. Only α·R_th and α/C_th act on the
-    electrical signals, so α is fixed at copper's value.
-    """
+    electrical signals, so α is fixed at copper's value."""
     dT = m.state("dT")
     m.scale("R", 1 + alpha * dT)
     m.rate(dT, (m.R * m.i**2 - dT / R_th) / C_th)
@@ -39,8 +38,7 @@ def magnet_heating(m: Equations,
     """Heating of the magnets, K/(1+α·ΔT). Hendershot & Miller, Permanent-Magnet Machines, 2010.
 
     ``C_th dΔT/dt = R i² − ΔT/R_th``, ΔT = 0 at the start of each run; neodymium has half of ferrite's coefficient.
-    Seen as a no-load speed that rises within minutes of heavy use.
-    """
+    Seen as a no-load speed that rises within minutes of heavy use."""
     dT = m.state("dT_magnet")
     m.scale("K", 1 / (1 + alpha_m * dT))
     m.rate(dT, (m.R * m.i**2 - dT / R_thm) / C_thm)
@@ -71,8 +69,7 @@ def driver_voltage_limit(m: Equations, V_lim=P(5.0, "V", null=float("inf"), posi
                                                doc="largest voltage of the driver")):
     """Saturation of the driver: larger commands than ±V_lim give no more. Åström & Murray, Feedback Systems, 2008.
 
-    Seen in the logs of controllers that ask for more than the supply has: commands beyond it change nothing.
-    """
+    Seen in the logs of controllers that ask for more than the supply has: commands beyond it change nothing."""
     m.limit("v", V_lim)
 
 
@@ -85,8 +82,7 @@ def driver_coast(m: Equations, R_c=P(50.0, "Ω", null=0.0, positive=True, grid=(
     """Coasting of the driver: at command 0 its bridge opens. Mohan, Electric Machines and Drives, 2012.
 
     The diodes put the supply against the current; linear, that is L di/dt = −(R + R_c) i, without the back-EMF.
-    Seen where the command is 0: no current while the motor turns, and a slow run-down.
-    """
+    Seen where the command is 0: no current while the motor turns, and a slow run-down."""
     shorted = ca.exp(-3 * R_c / m.R)  # what is left of the back-EMF: 1 at R_c = 0, none behind an open bridge
     m.voltage -= ca.if_else(ca.fabs(m.command) <= OPEN, R_c * m.i - (1 - shorted) * m.K_e * m.omega, 0)
 
@@ -97,8 +93,7 @@ def driver_one_quadrant(m: Equations, R_q=P(50.0, "Ω", null=0.0, positive=True,
     """One-quadrant drive: no current but along the command. Mohan et al., Power Electronics, 2003, ch. 7.
 
     One switch and a diode, a supply that takes nothing back: a motor whose back-EMF is larger runs free. Seen where
-    steps down are far slower than steps up.
-    """
+    steps down are far slower than steps up."""
     against = ca.if_else(m.command > OPEN, ca.fmin(m.i, 0), ca.if_else(m.command < -OPEN, ca.fmax(m.i, 0), m.i))
     m.voltage -= R_q * against
 
@@ -110,8 +105,7 @@ def pwm_coast(m: Equations, s_c=P(0.5, "", null=0.0, lower=0.0, upper=1.5, doc="
 
     Drivers switched by their enable pin, "fast decay": s is near 1 where a pause is long against L/R. Unless V_s is
     given it is the largest voltage of the records; s above 1 says that it is more. Seen as a motor that hardly brakes,
-    and runs too fast at small duty: several duties, with steps down.
-    """
+    and runs too fast at small duty: several duties, with steps down."""
     m.voltage += s_c * ca.fmax(1 - ca.fabs(m.v) / V_s, 0) * m.K_e * m.omega
 
 
@@ -123,8 +117,7 @@ def pwm_fast_decay(m: Equations, a_p=P(1.0, "", positive=True, grid=(0.3, 1.0, 3
 
     The bridge gives (d−φ)·V_s + (1−d−φ)·e in the mean, with e the back-EMF along the command and φ, at most 1−d, the
     share of a period in which the current ends, ln(1 + (V_s−e)/(V_s+e)·(1−exp(−a·d)))/a. Drivers switched by their
-    enable pin; a far above 1 is `pwm_coast` with s = 1. Seen as small duties that hardly drive: steps to all duties.
-    """
+    enable pin; a far above 1 is `pwm_coast` with s = 1. Seen as small duties that hardly drive: steps to all duties."""
     d, sign = ca.fmin(ca.fabs(m.v) / V_s, 1), ca.if_else(m.v < 0, -1, 1)
     e = sign * m.K_e * m.omega
     falls = ca.fmax(V_s - e, 0) / ca.fmax(V_s + e, 0.05 * V_s) * (1 - ca.exp(-a_p * d))
@@ -141,8 +134,7 @@ def driver_current_limit(m: Equations, I_lim=P(5.0, "A", null=float("inf"), posi
     """Current limit of the driver, which takes voltage away. Mohan, Electric Machines and Drives, 2012.
 
     The bridge gives no more than what holds the current at its limit, R·I + K·ω, and leads it there within L/(5 R).
-    Seen as a flat top of the current: hard steps from rest, reversals.
-    """
+    Seen as a flat top of the current: hard steps from rest, reversals."""
     width = LIMITER_WIDTH * m.R * I_lim
 
     def above(v, sign):
@@ -158,8 +150,7 @@ def driver_lag(m: Equations, T_v=P(5e-3, "s", null=0.0, positive=True, grid=(1.0
     """First-order lag of the driver: an output filter, a slow amplifier. Åström & Murray, Feedback Systems, 2008.
 
     Seen as current and speed that are both late: quick steps, both measured. T_v and L/R may change places in a fit:
-    fix L where it is known.
-    """
+    fix L where it is known."""
     z = m.state("v_lagged", m.base("R") * m.start["i"] + m.base("K") * m.start["omega"])  # holds it as it was
     m.rate(z, (m.v - z) / T_v)
     m.voltage -= m.v - z
@@ -175,8 +166,7 @@ def driver_slew(m: Equations, T_r=P(0.1, "s", null=0.0, positive=True, grid=(4.0
     """Slew-rate limit of the driver (ramp, soft start), V_s/T_r·tanh(Δv/V_w). Franco, Operational Amplifiers, 2015.
 
     Seen as steps that come as ramps, the larger the later; small ones as through a lag of T_r·V_w/V_s. Unless V_s is
-    given it is the largest voltage of the records.
-    """
+    given it is the largest voltage of the records."""
     z = m.state("v_ramped", m.base("R") * m.start["i"] + m.base("K") * m.start["omega"])
     m.rate(z, V_s / T_r * ca.tanh((m.v - z) / (V_w + V_s * NO_RAMP / T_r)))
     m.voltage -= m.v - z
@@ -187,8 +177,7 @@ def supply_sag(m: Equations, R_s=P(0.1, "Ω", null=0.0, lower=0.0, doc="resistan
     """Sag of the supply, d·(V_s − R_s·d·i), d = v/V_s. Mohan, Electric Machines and Drives, 2012.
 
     Only R_s/V_s² acts. Unless V_s is given it is the largest voltage of the records: the duty is one there.
-    Seen as a voltage missing with the duty squared and the current: steps to several duties, under load.
-    """
+    Seen as a voltage missing with the duty squared and the current: steps to several duties, under load."""
     m.voltage -= R_s * (m.v / V_s) ** 2 * m.i
 
 
@@ -217,8 +206,7 @@ def winding_warm_start(m: Equations, dT_0=P(0.0, "K", null=0.0, lower=-200.0, up
                                             doc="rise at the start")):
     """Winding warm at the start, beside winding_heating. Kirtley, Electric Power Principles, 2010.
 
-    Another rise in every run, against the first one, whose resistance at the start is R.
-    """
+    Another rise in every run, against the first one, whose resistance at the start is R."""
     if "dT" not in m.states:
         raise ModelError("winding_warm_start says how warm the winding of winding_heating begins: add that too.")
     m.initial["dT"] = ca.SX(dT_0)

@@ -44,8 +44,7 @@ def lugre(m: Equations, tau_c=P(2e-3, "N·m", null=0.0, lower=0.0, doc="Coulomb 
           theta_s=P(0.01, "rad", positive=True, grid=(0.003, 0.03), doc="presliding angle tau_c/σ0")):
     """Bristle friction with presliding (LuGre). Canudas de Wit et al., IEEE TAC 40(3), 1995.
 
-    The bristle damping σ1 is σ0 times the time to cross the presliding angle at the Stribeck speed.
-    """
+    The bristle damping σ1 is σ0 times the time to cross the presliding angle at the Stribeck speed."""
     level = 1 + (s_b - 1) * ca.exp(-((m.omega / omega_s) ** 2))  # g(ω)/tau_c
     z = m.state("z_bristle")  # deflection over the presliding angle
     rate = (m.omega - ca.fabs(m.omega) * z / level) / theta_s
@@ -61,8 +60,7 @@ def angular_friction(m: Equations, tau_m=P(2e-3, "N·m", null=0.0, lower=0.0, do
     """Friction that varies over a turn (a bent shaft), τ(1+a·sin(Nθ+φ))·sgn ω. Armstrong-Hélouvry, 1991.
 
     Seen as a friction that repeats every turn in both directions: turn slowly, measure the angle. Once or twice a turn
-    (a coupling out of line), what suits, unless N_f is given.
-    """
+    (a coupling out of line), what suits, unless N_f is given."""
     m.torque -= tau_m * (1 + a_f * ca.sin(N_f * m.theta + phi_f)) * m.sign(m.omega)
 
 
@@ -84,8 +82,7 @@ def eddy_brake(m: Equations, c_e=P(1e-5, "N·m·s/rad", null=0.0, lower=0.0, doc
                omega_b=P(50.0, "rad/s", positive=True, grid=(0.1, 0.3, 0.8), doc="speed of the largest torque")):
     """Eddy-current brake, c·ω/(1+(ω/ω_b)²). Wouterse, IEE Proc. B 138(4), 1991.
 
-    Seen as a drag that rises and then falls with the speed: a staircase up to full speed.
-    """
+    Seen as a drag that rises and then falls with the speed: a staircase up to full speed."""
     m.torque -= c_e * m.omega / (1 + (m.omega / omega_b) ** 2)
 
 
@@ -101,8 +98,7 @@ def gear_efficiency(m: Equations, mu_d=P(0.1, "", null=0.0, lower=0.0, upper=1.0
     """Efficiency of the gear, another share of the torque when driven back. Wang & Kim, ICRA, 2015.
 
     Only with J known (fixed) can the two shares be determined; otherwise `load_friction` does the same with another J.
-    Seen in hard braking beside hard acceleration.
-    """
+    Seen in hard braking beside hard acceleration."""
     carried, s = m.K_t * m.i if "i" in m.states else m.g * m.v, m.sign(m.omega)
     m.torque -= s * (mu_d * (ca.fabs(carried) + carried * s) + mu_b * (ca.fabs(carried) - carried * s)) / 2
 
@@ -125,8 +121,7 @@ def spring(m: Equations, k_s=P(1e-3, "N·m/rad", null=0.0, lower=0.0, doc="stiff
            theta_0=P(0.0, "rad", doc="angle at which it is relaxed")):
     """Spring to the frame (a return spring, a flexure), k·(θ−θ₀). Meirovitch, Fundamentals of Vibrations, 2001.
 
-    Seen as an angle that comes back at 0 V: small steps from rest, angle measured.
-    """
+    Seen as an angle that comes back at 0 V: small steps from rest, angle measured."""
     m.torque -= k_s * (m.theta - theta_0)
 
 
@@ -138,8 +133,7 @@ def end_stop(m: Equations, k_stop=P(1e-2, "N·m/rad", null=0.0, lower=0.0, doc="
     """End stops of the travel, k·x·(1+d·dx/dt) at x beyond one. Hunt & Crossley, J. Appl. Mech. 42(2), 1975.
 
     Seen as an angle that goes no further, however large the voltage: drive to both ends, angle measured. The angle of
-    a stop that was never reached is not determined.
-    """
+    a stop that was never reached is not determined."""
     above, below = ca.fmax(m.theta - theta_hi, 0), ca.fmax(theta_lo - m.theta, 0)
     m.torque -= k_stop * (above * ca.fmax(1 + d_stop * m.omega, 0) - below * ca.fmax(1 - d_stop * m.omega, 0))
 
@@ -157,8 +151,7 @@ def torque_ripple(m: Equations, a_r=P(0.05, "", null=0.0, lower=0.0, upper=0.5, 
                                      doc="1: in the back-EMF too, fixed")):
     """Torque ripple, K·i·(1+a·sin(N·θ+φ)), with e_r = 1 in the back-EMF too. Jahns & Soong, IEEE TIE 43(2), 1996.
 
-    What suits is taken, unless given. A model without a current has its torque constant g ripple.
-    """
+    What suits is taken, unless given. A model without a current has its torque constant g ripple."""
     wave = a_r * ca.sin(N_r * m.theta + phi_r)
     m.scale("K_t" if "i" in m.states else "g", 1 + wave)
     if "i" in m.states:
@@ -172,8 +165,7 @@ WIDE = 0.1  # rad: which a corner wider than a thousandth of a radian is, howeve
 def _two_inertias(m: Equations, share, resonance, zeta, twist_of, name: str) -> None:
     """Split J into motor and load joined by a shaft; `twist_of` shapes the elastic twist (a gap).
 
-    The total stays J. With load share r, stiffness ω_r²·J·r·(1−r), damping 2·ζ·ω_r·J·r·(1−r), all vanishes as r → 0.
-    """
+    The total stays J. With load share r, stiffness ω_r²·J·r·(1−r), damping 2·ζ·ω_r·J·r·(1−r), all vanishes as r → 0."""
     twist, omega_load = m.state(f"twist_{name}"), m.state(f"omega_{name}", m.start["omega"])
     slip = m.omega - omega_load
     elastic, contact = twist_of(twist)
@@ -229,8 +221,7 @@ def slip_clutch(m: Equations, r_slip=SHARE,
                 omega_slip=P(1.0, "rad/s", positive=True, grid=(0.01,), doc="slip at 3/4 of that"), b_slip=DRAG):
     """Load driven by friction that may slip, τ·tanh(Δω/ω_s): a clutch, a belt, a wheel. Awrejcewicz & Olejnik, 2005.
 
-    Seen as a motor that runs up too fast with hard steps and not with soft ones: ramps and steps of several sizes.
-    """
+    Seen as a motor that runs up too fast with hard steps and not with soft ones: ramps and steps of several sizes."""
     _driven_load(m, r_slip, b_slip, lambda slip: tau_slip * ca.tanh(slip / omega_slip), "slip")
 
 
@@ -241,8 +232,7 @@ def freewheel(m: Equations, r_free=SHARE,
     """Load behind a freewheel (one-way clutch), driven in one direction and free to overrun. Zhu & Parker, JSV, 2005.
 
     Seen as a motor that stops sooner than its inertia while running up allows. The direction that suits is taken,
-    unless given. While it grips its torque is J·r·(1−r)·g·Δω.
-    """
+    unless given. While it grips its torque is J·r·(1−r)·g·Δω."""
     grip = m.symbols["J"] * r_free * (1 - r_free) * g_free
     _driven_load(m, r_free, b_free, lambda slip: side * grip * ca.fmax(side * slip, 0), "free")
 

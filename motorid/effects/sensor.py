@@ -45,8 +45,7 @@ def speed_delay(m: Equations,
 def speed_average(m: Equations, T_a=P(5e-3, "s", null=0.0, positive=True, grid=(2.0, 6.0, 20.0), doc="window of mean")):
     """Averaging of the speed over a window (counts), Padé of orders 2 and 3. Golub & Van Loan, 2013, sec. 9.3.
 
-    Seen as straight flanks that come late after reversals.
-    """
+    Seen as straight flanks that come late after reversals."""
     # (1 − e⁻ˣ)/x = (120 + 2x²)/(120 + 60x + 12x² + x³) at x = Ts, exact up to x⁵.
     _filter(m, "omega", "mean", T_a, (120, 60, 12), (0, 1 / 60))
 
@@ -55,8 +54,7 @@ def speed_average(m: Equations, T_a=P(5e-3, "s", null=0.0, positive=True, grid=(
 def speed_gain(m: Equations, k_w=P(0.01, "", null=0.0, lower=-0.9, upper=9.0, doc="relative error of the speed scale")):
     """Wrong scale of the speed sensor. Isermann, Identification of Dynamic Systems, 2011.
 
-    Needs an angle, or fixed motor constants, to be distinguished from K and J.
-    """
+    Needs an angle, or fixed motor constants, to be distinguished from K and J."""
     m.scale("smoothing", 1 / (1 + k_w))  # a width of the records: a scale of K and J must not sharpen friction
     m.measure("omega", m.measured("omega") * (1 + k_w))
 
@@ -65,8 +63,7 @@ def speed_gain(m: Equations, k_w=P(0.01, "", null=0.0, lower=-0.9, upper=9.0, do
 def speed_offset(m: Equations, w_0=P(0.5, "rad/s", null=0.0, doc="added by the speed sensor")):
     """Offset of the speed sensor (a tacho, a gyro). Isermann, Identification of Dynamic Systems, 2011.
 
-    While the motor turns, a voltage offset with a load does the same; records at standstill or an angle tell.
-    """
+    While the motor turns, a voltage offset with a load does the same; records at standstill or an angle tell."""
     m.measure("omega", m.measured("omega") + w_0)
 
 
@@ -77,8 +74,7 @@ def speed_ripple(m: Equations, a_w=P(0.02, "", null=0.0, lower=0.0, upper=0.3, d
                  e_w=P(0.0, "", vary=False, lower=0.0, upper=1.0, grid=(0.0, 1.0), doc="1: in the angle too, fixed")):
     """Ripple of the speed as read, ω·(1+a·sin(N·θ+φ)): a tacho's, an encoder's. Isermann, Mechatronic Systems, 2005.
 
-    With e_w = 1 it is an encoder off centre, in whose angle it shows too. What suits is taken, unless given.
-    """
+    With e_w = 1 it is an encoder off centre, in whose angle it shows too. What suits is taken, unless given."""
     size, begun = e_w * a_w / N_w, 0.0  # the rate of the angle's ripple is the speed's
     m.measure("omega", m.measured("omega") * (1 + a_w * ca.sin(N_w * m.theta + phi_w)))
     m.measure("theta", m.measured("theta") - size * ca.cos(N_w * m.theta + phi_w))
@@ -112,8 +108,7 @@ def current_offset(m: Equations, i_0=P(0.02, "A", null=0.0, doc="added by the cu
 def current_gain(m: Equations, k_i=P(0.01, "", null=0.0, lower=-0.9, upper=9.0, doc="relative error of current scale")):
     """Wrong scale of the current sensor. Isermann, Identification of Dynamic Systems, 2011.
 
-    R, L, b and J take it up: fix one of them (R by an ohmmeter) to determine it.
-    """
+    R, L, b and J take it up: fix one of them (R by an ohmmeter) to determine it."""
     m.measure("i", m.measured("i") * (1 + k_i))
 
 
@@ -125,8 +120,7 @@ def supply_side_current(m: Equations, V_dc=P(12.0, "V", positive=True, vary=Fals
 
     With u_i = 1 it counts positive out of the supply, whichever way the motor turns; what suits, unless given. Unless
     V_dc is given it is the largest voltage of the records; a larger one leaves R, L, b and J wrong by that factor.
-    Seen as next to no current at small duties, whatever the load.
-    """
+    Seen as next to no current at small duties, whatever the load."""
     duty = ca.fmin(ca.fabs(m.command) / V_dc, 1) * (1 + u_i * (ca.sign(m.command) - 1))
     m.measure("i", m.measured("i") * (1 - s_i + s_i * duty))
 

@@ -82,8 +82,7 @@ def functions_of(found: Fit | Model) -> list[ca.Function]:
 
     ``rhs(x, u, p)``, ``outputs(x, u, p)``, ``initial(s, p)`` with s = (i, omega, theta) at the start,
     ``step(x, u0, u1, h, p)`` (the input runs from u0 to u1 over h), ``parameters()``; of a fit also, per record,
-    ``record_k()`` (t, s, u, p) and ``simulate_k(s, u, p)`` with the very steps of the fit. Columns are samples.
-    """
+    ``record_k()`` (t, s, u, p) and ``simulate_k(s, u, p)`` with the very steps of the fit. Columns are samples."""
     system = system_of(found)
     functions = [*plain_functions(system), ca.Function("parameters", [], [ca.DM(values_of(found, system))], [], ["p"])]
     return [*functions, *_simulations({f.name(): f for f in functions}, records_of(found))]

@@ -24,8 +24,7 @@ class Equations:
     An effect reads ``m.i, m.omega, m.theta, m.v, m.R, m.K, …`` and writes ``m.voltage``, ``m.torque``, `scale`,
     `replace`, `state`/`rate` and `measure`. A quantity that is read is a placeholder, filled when the model closes, so
     the order of effects does not matter. `states` are those of the base, among ``i, omega``; with `angle_input` the
-    angle seen by the effects is a given signal instead of the model's own state.
-    """
+    angle seen by the effects is a given signal instead of the model's own state."""
 
     def __init__(self, states: tuple[str, ...], angle_input: bool = False) -> None:
         self.states: dict[str, ca.SX] = {name: ca.SX.sym(name) for name in states}
@@ -96,8 +95,7 @@ class Equations:
         """Return what was measured beside the voltage, e.g. ``"tau_load"``; the model's records must have it.
 
         Computed from the voltage, in s: the time ``"since_change"``, ``"since_reversal"`` and ``"since_switch"``, the
-        last negative while it is off.
-        """
+        last negative while it is off."""
         among(name, (*MEASURED_INPUTS, *COMPUTED_INPUTS), "input", ModelError, f"{self.writer}: ")
         return self.inputs.setdefault(name, ca.SX.sym(name))
 

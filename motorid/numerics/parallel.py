@@ -36,8 +36,7 @@ class OneThread(ContextDecorator):
 
     Threads that share out products of a few columns only wait for one another: twice the processor time for the
     same wall time alone, and several times the wall time beside another busy process. The setting is the
-    process's: the first thread that comes in makes it and takes it back when it leaves, others find it made.
-    """
+    process's: the first thread that comes in makes it and takes it back when it leaves, others find it made."""
 
     def __init__(self) -> None:
         self._lock, self._owner, self._depth = threading.Lock(), 0, 0

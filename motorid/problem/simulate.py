@@ -46,8 +46,7 @@ class Simulation:
 class Evaluation(Shown):
     """How well values explain records: NRMSE and RMSE per channel, over all runs and run by run.
 
-    NRMSE is RMSE over the RMS of the channel on the same samples, of an angle from where it begins; NaN if still.
-    """
+    NRMSE is RMSE over the RMS of the channel on the same samples, of an angle from where it begins; NaN if still."""
 
     simulations: tuple[Simulation, ...]
     nrmse: Mapping[str, float]

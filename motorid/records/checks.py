@@ -746,8 +746,7 @@ def _cosine(a: Array, b: Array | None) -> float:
 def _speed_cosine(run: Experiment) -> float:
     """Return the cosine of the integral of the voltage and the travel, where no speed was measured.
 
-    Against a spring the angle itself follows the voltage: if only where it has come to rest under several of them.
-    """
+    Against a spring the angle itself follows the voltage: if only where it has come to rest under several of them."""
     theta = run.outputs.get("theta")
     if theta is None or len(edges := _block_edges(theta)) < 6:
         return 0.0

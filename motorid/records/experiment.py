@@ -159,8 +159,7 @@ class Experiment(Shown):
         """Return every k-th sample, of each part between pauses by itself.
 
         Outputs are picked, not filtered: a filter would add a lag that looks like physics. A held voltage is
-        averaged over each longer step, which keeps its integral; a linear one is picked, and other inputs are.
-        """
+        averaged over each longer step, which keeps its integral; a linear one is picked, and other inputs are."""
         if int(k) != k or k < 1:
             raise UsageError(f"decimate() takes a whole number of at least 1; got {k!r}.")
         parts = parts_of(self) if k > 1 else [slice(0, self.n)]
@@ -186,8 +185,7 @@ class Experiment(Shown):
         """Return the run with a voltage that acts later than its column says, earlier if `seconds` is negative.
 
         Before the record there was none where the motor begins at rest, else as much as at its beginning; a held one
-        that moves by parts of a sample is averaged over each.
-        """
+        that moves by parts of a sample is averaged over each."""
         if not np.isfinite(seconds) or abs(seconds) >= self.duration:
             raise UsageError(f"{self.name}: a voltage can be delayed by less than the {self.duration:.4g} s of the "
                              f"run; got {seconds!r}.")
@@ -205,8 +203,7 @@ class Experiment(Shown):
         Not next to jumps of the voltage, where the motor is quick; at least three, at most 5 % of a channel. Of speed
         and angle, two or three in a row that jump there and back are left out too, what jumps beyond all else and
         fades, and zeros, up to a fifth, amid what stays far from them: a mass cannot. Of a part that a diagnosis looks
-        at those of the whole record are.
-        """
+        at those of the whole record are."""
         free, known = "tau_load" not in self.inputs, self.meta.get("spikes")  # a blow of the load may be as short
         outputs = {c: preprocessing.without_spikes(self.t, y, self.inputs["v"], inert=free and c != "i")
                    if known is None else np.where(np.isin(self.t, known.get(c, ())), np.nan, y)

@@ -63,8 +63,7 @@ class Explorer:
     """What `explore` shows. Everything that the mouse can do is a method, too.
 
     `fit` is the one given, or the last refit; `model` is as ticked and set at present, `evaluation` its errors on the
-    records; `message` says what the last action did, or why it could not; `widget` is the controls and the figure.
-    """
+    records; `message` says what the last action did, or why it could not; `widget` is the controls and the figure."""
 
     def __init__(self, start: Fit, effects: Sequence[Effect]) -> None:
         self.fit, self.runs, self._first = start, start.problem.experiments, start

@@ -59,8 +59,7 @@ class Batch:
     """What came of many motors.
 
     A row holds ``motor``, ``status`` (``"converged"``, … or ``"failed"``), ``message``, ``flags``, ``seconds``, per
-    parameter its value and ``<name>_std`` (None: not determined), ``nrmse_<channel>``, ``chi2`` and ``dof``.
-    """
+    parameter its value and ``<name>_std`` (None: not determined), ``nrmse_<channel>``, ``chi2`` and ``dof``."""
 
     rows: tuple[dict[str, Any], ...]  # one per motor, in the order given
     parameters: tuple[str, ...]  # the free ones

@@ -1,7 +1,6 @@
 """Bootstrap: the spread of refits to records that might as well have been measured.
 
-Efron & Tibshirani, An Introduction to the Bootstrap, 1993; blocks: Künsch, Annals of Statistics 17, 1989.
-"""
+Efron & Tibshirani, An Introduction to the Bootstrap, 1993; blocks: Künsch, Annals of Statistics 17, 1989."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -35,8 +34,7 @@ class Bootstrap(Printed):
     """Refits to resampled records.
 
     They start from the fit, so what the data do not determine hardly moves: its spread says nothing, and neither a
-    standard deviation nor an interval is given.
-    """
+    standard deviation nor an interval is given."""
 
     kind: str
     names: tuple[str, ...]

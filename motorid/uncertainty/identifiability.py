@@ -3,8 +3,7 @@
 A record determines a direction in parameter space when a step along it changes the outputs by more than the noise.
 The Jacobian of the fit says so without a fit: its columns scaled to relative changes, its rows by the noise, its
 singular values are the signal-to-noise ratios of such steps (Golub & Van Loan, Matrix Computations; Miao et al., "On
-identifiability of nonlinear ODE models", SIAM Review 53, 2011). It works on planned experiments too.
-"""
+identifiability of nonlinear ODE models", SIAM Review 53, 2011). It works on planned experiments too."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

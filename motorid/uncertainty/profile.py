@@ -2,8 +2,7 @@
 
 The only interval that can say "no upper end": where the cost stays low however far the parameter moves, the data do not
 limit it on that side (Raue et al., Bioinformatics 25, 2009). The rise of the cost is divided by the factor by which
-coloured residuals enlarge the parameter's variance (Kent, Biometrika 69, 1982). `intervals`: beside other methods.
-"""
+coloured residuals enlarge the parameter's variance (Kent, Biometrika 69, 1982). `intervals`: beside other methods."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
