@@ -101,7 +101,7 @@ def in_library_words(name, numbers, motor):
     if name == "freewheel":
         n["g_free"] = n.pop("c_g") * (1 / motor.J + 1 / J_l)
     if name in ("driver_coast", "driver_one_quadrant"):  # so soon that it does not matter how
-        n = {"R_c" if name == "driver_coast" else "R_q": 100 * motor.R}
+        n = {"R_c" if name == "driver_coast" else "R_q": 1e4 * motor.R}
     if name == "lugre":
         theta_s = n["tau_c"] / n.pop("sigma_0")
         n |= {"s_b": n.pop("tau_s") / n["tau_c"], "theta_s": theta_s}

@@ -18,6 +18,7 @@ from motorid.diagnosis.model_comparison import Node, evidence, far, share_of
 from motorid.diagnosis.predictive_score import QUICK, Evidence, Predictions, compare
 from motorid.diagnosis.thresholds import MOST, PLAIN, STANDARD_ERRORS, SUPPLANTS, TRIFLE, UNCONTESTED
 from motorid.display.numbers import listed, number, percent
+from motorid.effects import LIBRARY
 from motorid.errors import ModelError, otherwise
 from motorid.estimation.angle_orders import uses_angle
 from motorid.estimation.fit import follows, solve
@@ -31,7 +32,6 @@ from motorid.records.checks import current_limit
 
 LIMITER = "driver_current_limit"
 IN_ITS_PLACE = "{}, which the library lacks, predicts better in its place"
-AS_LATE = 4.0  # half samples: what is later is late by itself
 DIFFERENCED = "the speed reads half a sample late, as a difference of counts does"
 LATENESS = {"speed_lag": 1.0, "speed_delay": 1.0, "speed_average": 0.5}  # mean, of the time of these effects
 
@@ -297,7 +297,8 @@ def _insignificant(last: Node, effect: Effect, structure: bool, root: Node,
 
 
 def _half_a_sample(fit: Fit, effect: Effect) -> bool:
-    """Tell whether an effect makes the speed late by half a sample of the records: so is the mean over each."""
+    """Tell whether an effect makes the speed late by half a sample of the records, or the mean over each predicts as
+    well in its place, whatever lag the winding, the rotor and the noise of counts then share out among them."""
     if effect.name not in LATENESS:
         return False
     run, name, share = fit.problem.experiments[0], effect.parameters[0].name, LATENESS[effect.name]
@@ -305,10 +306,8 @@ def _half_a_sample(fit: Fit, effect: Effect) -> bool:
     late, unsure = share * fit.values[name], STANDARD_ERRORS * share * (fit.std.get(name) or 0.0)
     if abs(late - half) < max(TRIFLE * half, min(unsure, half)):
         return True
-    if late > AS_LATE * half:
-        return False  # else the winding's own lag, or the noise of counts, may make up for the rest
-    held = fit.problem.with_(model=fit.model.fix(**{name: half / share}))
-    other = otherwise(None, FAILURES, lambda: solve(held, QUICK, start="model"))
+    model = (fit.model.without(effect.name) + LIBRARY["speed_average"]).fix(T_a=2 * half)
+    other = otherwise(None, FAILURES, lambda: solve(fit.problem.with_(model=model), QUICK))
     both = [f and predictive_score.predictions_left_out(f) for f in (other, fit)]
     return all(both) and not compare(*(Predictions(known or {}, {}) for known in both)).worth_it
 

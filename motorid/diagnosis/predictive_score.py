@@ -133,8 +133,8 @@ def lost_channels(old: Channels, new: Channels) -> tuple[str, ...]:
 
 
 def _fine_enough(old: Channels, new: Channels) -> tuple[str, ...]:
-    """Return the angle, where both models follow it so closely that its error is asked no more, beside others."""
-    return tuple(c for c in old if len(old) > 1 and c in new and old[c].fine and new[c].fine)
+    """Return the angle, where both models follow it so closely that its error is asked no more."""
+    return tuple(c for c in old if c in new and old[c].fine and new[c].fine)
 
 
 def _without(channels: Channels, gone: Collection[str]) -> Channels:
@@ -257,9 +257,8 @@ def finer(fit: Fit, channel: str) -> bool:
 
 
 def undecided(fit: Fit) -> set[str]:
-    """Return the angle, where it decides nothing: followed so closely beside other channels, or than its noise."""
-    return {c for c in fit.problem.outputs
-            if finer(fit, c) and (len(fit.problem.outputs) > 1 or fit.misfit[c] > thresholds.LARGER)}
+    """Return the angle, where it decides nothing: followed so closely."""
+    return {c for c in fit.problem.outputs if finer(fit, c)}
 
 
 @lru_cache(maxsize=4)

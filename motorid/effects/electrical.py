@@ -87,15 +87,20 @@ def driver_coast(m: Equations, R_c=P(50.0, "Ω", null=0.0, positive=True, grid=(
     m.voltage -= ca.if_else(ca.fabs(m.command) <= OPEN, R_c * m.i - (1 - shorted) * m.K_e * m.omega, 0)
 
 
+QUICKEST = 100.0  # in R: how firmly a current that ends is led to zero; no sample tells more, and steps would be short
+
+
 @effect(balance="voltage", includes=("driver_coast",))
 def driver_one_quadrant(m: Equations, R_q=P(50.0, "Ω", null=0.0, positive=True, grid=(3.0, 30.0),
                                             doc="resistance against a current that the drive does not carry")):
     """One-quadrant drive: no current but along the command. Mohan et al., Power Electronics, 2003, ch. 7.
 
-    One switch and a diode, a supply that takes nothing back: a motor whose back-EMF is larger runs free. Seen where
-    steps down are far slower than steps up."""
-    against = ca.if_else(m.command > OPEN, ca.fmin(m.i, 0), ca.if_else(m.command < -OPEN, ca.fmax(m.i, 0), m.i))
-    m.voltage -= R_q * against
+    One switch and a diode, a supply that takes nothing back: a motor whose back-EMF is larger runs free, its current
+    ends within L/R_q. Seen where steps down are far slower than steps up."""
+    drives = m.v - m.R * m.i - m.K_e * m.omega
+    more = (drives - R_q * m.i) / (1 + R_q / (QUICKEST * m.R)) - drives
+    along = ca.if_else(m.command > 0, ca.fmax(more, 0), ca.fmin(more, 0))
+    m.voltage += ca.if_else(ca.fabs(m.command) <= OPEN, -R_q * m.i, along)
 
 
 @effect(balance="voltage")

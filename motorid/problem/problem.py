@@ -202,6 +202,7 @@ class Problem:
         same = np.array_equal(grid.substeps, run.grid.substeps) and np.array_equal(grid.u1, run.grid.u1)
         return run if same else replace(run, grid=grid)
 
+    @np.errstate(over="ignore", invalid="ignore")  # of a model that runs away no step is placed
     def _with_steps_placed(self, k: int, grid: Grid, x0: Array, p: Array) -> Grid:
         """Return a grid where a step of the voltage comes, as a ramp of the same mean, with that of the samples left
         out before it is seen for which the outputs beside it surely ask: an angle keeps for ever what it did."""

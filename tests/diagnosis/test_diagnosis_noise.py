@@ -133,13 +133,15 @@ def test_adequate_although_larger_than_the_noise_says_what_was_tried(lab):
 
 def test_what_is_a_tenth_of_rounding_is_not_worth_a_word(lab, rng):
     """Rounding repeats itself at a steady speed, as coloured as anything: the same share of true noise is."""
-    runs = [r.without("i", "omega") for r in runs_of(lab, {}, ("stairs", "ramps"))]
+    line = 2 * np.pi / 16  # so coarse that what is left of the angle is more than a thousandth of it
+    runs = [r.with_(outputs={"theta": line * np.floor(r.outputs["theta"] / line)})
+            for r in runs_of(lab, {}, ("stairs", "ramps"))]
     small = Score(LIBRARY["coulomb"], 0.1, (), 400.0)
     fit = mi.fit(mi.dc_motor(), runs)
     assert adequacy(fit).channels["theta"]["rounded"] == 1.0
     assert adequacy(fit, [small]).adequate
     assert not adequacy(fit, [replace(small, drop=0.3)]).adequate
-    noisy = [r.with_(outputs={"theta": r.outputs["theta"] + 0.01 * rng.normal(size=r.n)}) for r in runs]
+    noisy = [r.with_(outputs={"theta": r.outputs["theta"] + 4 * line * rng.normal(size=r.n)}) for r in runs]
     fit = mi.fit(mi.dc_motor(), noisy)
     assert adequacy(fit).channels["theta"]["rounded"] == 0.0
     assert adequacy(fit).adequate

@@ -259,7 +259,8 @@ def test_a_fine_angle_is_not_asked_either_what_its_noise_nearly_hides(lab):
     assert 1.2 < fit.misfit["theta"] < LARGER
     assert adequacy(fit).channels["theta"]["p_value"] == 1.0
     alone = mi.fit(mi.dc_motor().fix(R=lab.R, L=lab.L), [run.without("i", "omega") for run in runs])
-    assert deciding(alone) is alone  # what is measured alone is asked all
+    assert deciding(alone) is alone  # scored as it is where nothing else is
+    assert adequacy(alone).adequate
 
 
 @pytest.mark.parametrize(("hidden", "close"), [({}, True), ({"cogging": {"A": 3e-2, "N": 12, "phi": 0.5}}, False)])

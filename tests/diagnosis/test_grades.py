@@ -564,6 +564,18 @@ def test_half_a_sample_is_told_where_no_current_keeps_it_apart_from_the_winding(
     assert misspecification._half_a_sample(fit, LIBRARY["speed_lag"]) is (lag == 0)
 
 
+def test_half_a_sample_is_told_where_the_rotor_and_the_sensor_have_changed_places():
+    """In a blind trial a lag of 37 ms was named beside a rotor of 5: a rotor of 37, and counts over 10 ms."""
+    rng, t, line = np.random.default_rng(0), 1e-2 * np.arange(900), 2 * np.pi / 96
+    motor = mi.dc_motor(R=0.73, L=2.9e-4, K=0.0123, b=1.16e-5, J=8.3e-6)
+    blank = mi.Experiment(t, {"v": np.repeat(rng.uniform(-6, 6, 18), 50)}, {"theta": 0 * t})
+    counts = np.floor(mi.simulate(motor, blank, initial="rest")[0].outputs["theta"] / line)
+    read = blank.with_(outputs={"omega": np.diff(counts, prepend=counts[0]) * line / 1e-2})
+    fit = mi.fit(mi.dc_motor(J=1.1e-6) + mi.effects.speed_lag(T_w=0.036), read, start="model")
+    assert fit.values["T_w"] > 0.03
+    assert misspecification._half_a_sample(fit, LIBRARY["speed_lag"])
+
+
 @pytest.mark.parametrize(("kept", "told"), [(0.15, True), (0.4, False)])
 def test_what_a_speed_of_few_lines_is_later_than_half_a_sample_must_matter(kept, told):
     """In a blind trial a lag of 2.8 ms was named where counts over 4 ms are 2 ms late; it made 0.3 % of the error."""

@@ -134,3 +134,16 @@ def test_a_gap_of_radians_is_found(seed):
     assert found.effects == ("backlash",)
     assert found.after.values["gap"] == pytest.approx(2.5, rel=0.02)
     assert found.after.fits == "noise"
+
+
+@pytest.mark.parametrize("R_q", [3.0, 365.0, 1e4])
+def test_a_drive_that_carries_no_current_back_is_simulated_however_firmly(R_q):
+    """Where the current ends within a sub-step, steps that began before it grew without bound: sizes were "open"."""
+    t = 4e-3 * np.arange(600)
+    v = np.repeat(np.random.default_rng(0).uniform(0, 24, 12), 50)
+    run = mi.Experiment(t, {"v": v}, {"i": 0 * t, "omega": 0 * t})
+    motor = mi.dc_motor(R=0.474, L=3.3e-4, K=0.043, b=2.7e-4, J=3.5e-4) + mi.effects.driver_one_quadrant(R_q=R_q)
+    (y,) = mi.simulate(motor, run, initial="rest")
+    assert y.outputs["i"].min() > -0.1 or R_q < 100
+    problem = mi.Problem(motor, [run.with_(outputs={c: y.outputs[c] + 0.1 for c in ("i", "omega")})])
+    assert mi.check_derivatives(problem.refined(problem.start), problem.start, tolerance=1e-3).ok
