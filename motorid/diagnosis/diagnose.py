@@ -31,7 +31,7 @@ from motorid.numerics import parallel
 from motorid.records.checks import as_command, contradictions, current_limit
 from motorid.records.experiment import Experiment, repeated, units_of
 
-CURVE = 30.0  # s for the curve of what is left, or as long as the search took
+CURVE = 30.0  # s for the curve of what is left, without a budget; `as_effect` goes on from there
 SETTLED = 16.0  # of an expected χ² between two models: half of it, the gain, is two of its standard deviations, √χ²
 
 
@@ -85,8 +85,8 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
         twice = repeated(fit.problem.experiments, [validate] if isinstance(validate, Experiment) else validate or ())
         misread = _contradicting(found, fit.problem.experiments)
         records = () if driven else fit.problem.experiments  # as they were read
-        spent = time.monotonic() - began
-        left = 0.0 if misread else min(max(spent, CURVE), float("inf") if budget is None else max(budget - spent, 0.0))
+        rest = CURVE if budget is None else max(budget - (time.monotonic() - began), 0.0)
+        left = 0.0 if misread else rest
         return _told(found, misread, " ".join(w for w in (twice, driven) if w), validate is not None, records, left)
 
 

@@ -326,9 +326,9 @@ def test_nor_does_such_an_angle_on_blocks_left_out(rng):
         1e3, theta=size * h).items()}}, {}) for size, fine in ((0.2, True), (0.1, True), (20.0, False)))
     assert not compare(old, new).sure
     assert compare(missed, old).sure  # an angle that is missed is asked
-    alone, other = ([Predictions({"theta": p.blocks["theta"]}, {}) for p in pair] for pair in ((old, new), (missed, new)))
+    alone, ill = ([Predictions({"theta": p.blocks["theta"]}, {}) for p in (before, new)] for before in (old, missed))
     assert not compare(*alone).sure  # plain motors with an encoder alone were faulty in three of four blind trials
-    assert compare(*other).sure
+    assert compare(*ill).sure
 
 
 def test_which_angle_is_followed_as_closely_as_can_be_asked(lab):
