@@ -156,7 +156,7 @@ def _told(found: Climb, misread: str, driven: str, validated: bool, records: Seq
         verdict, where = "unexplained", missing.where
         closed = left.nearest() if left.errors else ()
         answer = words.unexplained_text(ranking, ladder.rungs, graded, like.text if like else "", remaining,
-                                        words.curve_text(ladder.rungs, left.errors, closed),
+                                        words.curve_text(ladder.rungs, left.errors, closed), errors=left.errors,
                                         whole=found.search.whole, done=bool(found.rounds) and not found.stopped)
         judged, known = (judged, []) if len(found.path) > 1 else (remaining, [remaining.text])
         details = [*known, missing.text, words.rises_text(ladder.rungs)]

@@ -111,6 +111,7 @@ _PUSHES = (  # words, balance, carrier, quantities
     ("a load", "torque", "", ("turn", "theta", "t", "run")),
     ("a drag", "torque", "omega", ("t", "distance", "turn", "theta", "i", "run", "past speed", "past power",
                                  "past heat")),
+    ("a windage", "torque", "windage", ("t", "theta")),
     ("a torque", "torque", "", ("omega", "i")),
     ("an inertia", "torque", "acceleration", ("turn", "theta", "run", "omega", "most i")),
     ("a transient from each run's initial state, or an inertia", "torque", "acceleration", ("t",)),
@@ -511,7 +512,7 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
         found["energy"] = 0.5 * fit.values["J"] * omega**2
         gone = np.cumsum(0.5 * np.abs(omega[1:] + omega[:-1]) * np.diff(run.t))  # both directions counted
         found["path"], found["distance"] = found["direction"], np.concatenate([[0.0], gone])
-        found["past speed"], found["past power"] = np.abs(omega), omega**2
+        found["past speed"], found["past power"], found["windage"] = np.abs(omega), omega**2, omega * np.abs(omega)
     if "i" in found:
         found["load"] = found["past load"] = found["v"] * found["i"]
         found["most i"] = np.maximum.accumulate(np.abs(found["i"]))

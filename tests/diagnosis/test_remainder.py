@@ -716,6 +716,26 @@ def test_what_a_magnet_adds_to_a_current_or_slips_is_found(law, form, channels, 
         assert [p.value for p in found.remainder.as_effect().parameters] == pytest.approx([2e-5 * 70, 10.0], rel=0.01)
 
 
+@mi.effect(balance="torque")
+def thinning_air(m, c=mi.P(1.5e-6, "N·m·s²/rad²", null=0.0)):
+    """A vane in a bell jar that is pumped out."""
+    z = m.state("clock")
+    m.rate(z, 1.0)
+    m.torque -= c * ca.exp(-z / 0.3) * m.omega * ca.fabs(m.omega)
+
+
+def test_a_windage_that_fades_is_found_and_leads(lab):
+    """Without the square of the speed five times the noise was left in a blind trial, and three effects led."""
+    runs, floor = _with_law(thinning_air, ANGLE[:2], lab)
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2:], effects=("coulomb", "quadratic_drag"))
+    assert found.answer.startswith("Unexplained: a windage that changes with the time, which ")
+    after = mi.evaluate(found.remainder.fitted, runs[2]).nrmse
+    assert max(after[c] / floor[c] for c in after) < 1.1
+    sizes = [p.unit for p in found.remainder.as_effect().parameters if p.null == 0]
+    assert set(sizes) == {"N·m·s²/rad²"}
+    assert "m.torque -= m.omega * ca.fabs(m.omega) * curve" in found.remainder.code()
+
+
 @mi.effect(balance="sensor")
 def tacho_drifts(m, k=mi.P(0.1, "", null=0.0)):
     z = m.state("clock")
