@@ -390,13 +390,14 @@ def _read_and_climbed(fit: Fit, held_out: Sequence[Experiment] | None,
 
 def _remembers(found: Climb, whole: Fit, held_out: Sequence[Experiment] | None) -> bool:
     """Tell whether a model with a memory, which begins anew in every part of a record, leaves noise on whole ones: one
-    on the way, or the most promising that was refused. Not where these would take more than `WHOLE` times as long."""
-    runs = versions.whole_of(found.search.root.fit, whole.problem.experiments)
-    if found.remaining.adequate or not runs:
+    on the way, or the most promising that was refused where all that was found leaves more. Not where these would take
+    more than `WHOLE` times as long."""
+    if not (runs := versions.whole_of(found.search.root.fit, whole.problem.experiments)):
         return False
     refused = (c for tried in found.rounds[-1:] for c in tried if c.fit is not None and c.fit.memories)
-    best = max(refused, key=lambda c: c.gain or 0.0, default=None)
-    for fit in (*(node.fit for node in found.path[1:]), best and best.fit):
+    best, enough = max(refused, key=lambda c: c.gain or 0.0, default=None), found.remaining.adequate
+    fits = [node.fit for node in found.path[1:]]
+    for fit in fits[:-1] if enough else [*fits, best and best.fit]:
         with contextlib.suppress(*FAILURES):
             again = versions.fitted_to(fit, runs, QUICK) if fit and fit.memories else None
             if again is not None and at_noise(node_of(again, HeldOut.of(whole, held_out))):

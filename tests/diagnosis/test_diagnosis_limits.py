@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from motorid.diagnosis import record_versions as parts
 from motorid.diagnosis.admissibility import objections, samples_within, unresolved
 from motorid.diagnosis.candidates import Search, Stages, library
 from motorid.diagnosis.model_comparison import node_of
-from motorid.diagnosis.predictive_score import QUICK
+from motorid.diagnosis.predictive_score import QUICK, HeldOut
 from motorid.diagnosis.score_test import score
 from motorid.effects import LIBRARY
 from motorid.errors import ModelError
@@ -305,6 +306,14 @@ def test_what_remembers_is_looked_at_on_whole_records(monkeypatch):
     found = mi.diagnose(whole, runs[2], effects=("freewheel", "coulomb", "quadratic_drag"))
     assert (found.verdict, found.effects) == ("missing", ("freewheel",))
     assert "parts of" not in found.text
+    few = parts.affordable(whole)
+    held = HeldOut.of(few, runs[2])
+    more = few.model + mi.effects.freewheel + mi.effects.constant_load  # in parts it takes up what the load begins with
+    path = [node_of(mi.fit(m, few.problem.experiments), held) for m in (few.model, more.without("constant_load"), more)]
+    for nodes, anew in ((path, True), (path[:2], False), (path[::2], False)):
+        climb = SimpleNamespace(search=SimpleNamespace(root=path[0]), path=nodes, rounds=(),
+                                remaining=SimpleNamespace(adequate=True))
+        assert stepwise._remembers(climb, whole, runs[2:]) is anew  # what is smaller leaves noise on whole ones
     monkeypatch.setattr(stepwise.versions, "WHOLE", 2)  # these are three times as long
     assert "parts of" in mi.diagnose(whole, runs[2], effects=("freewheel",)).text
 
