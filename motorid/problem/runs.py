@@ -162,7 +162,7 @@ def initial_state(run: Experiment, sigma: Mapping[str, float],
 def at_rest(run: Experiment, sigma: Mapping[str, float]) -> tuple[bool, int]:
     """Tell whether the run begins at rest, and how many samples that lasts."""
     lead = _lead(run)
-    if not _may_rest(run, sigma, lead):
+    if not _may_rest(run, sigma, lead) or not (lead or {"omega", "theta"} & {*sigma}):  # which a current does not tell
         return False, 1
     if "omega" not in run.outputs and "theta" in run.outputs:
         y, t = run.outputs["theta"], run.t

@@ -266,6 +266,8 @@ def test_the_speed_at_the_start_is_estimated_where_the_current_alone_is_measured
     assert fit.initial["omega_0[0]"] == pytest.approx(true, rel=0.05)
     still = simulated(t, drive(t, 6.0), ("i",))
     assert [p.name for p in as_problem(TRUE, still).unknown] == list(VALUES)  # one that begins at rest does so
+    running = still.select(slice(400, None)).with_(sigma={"i": 0.05})  # at a current within its noise, the voltage on
+    assert [p.name for p in as_problem(TRUE, running).unknown[5:]] == ["i_0[0]", "omega_0[0]"]
 
 
 def test_a_first_current_that_was_not_measured_accelerates_no_more_than_the_records_show(rng):
