@@ -85,8 +85,7 @@ def diagnose(fit: Fit, validate: Sequence[Experiment] | Experiment | None = None
         twice = repeated(fit.problem.experiments, [validate] if isinstance(validate, Experiment) else validate or ())
         misread = _contradicting(found, fit.problem.experiments)
         records = () if driven else fit.problem.experiments  # as they were read
-        rest = CURVE if budget is None else max(budget - (time.monotonic() - began), 0.0)
-        left = 0.0 if misread else rest
+        left = 0.0 if misread else CURVE if budget is None else max(budget - (time.monotonic() - began), 0.0)
         return _told(found, misread, " ".join(w for w in (twice, driven) if w), validate is not None, records, left)
 
 

@@ -133,8 +133,7 @@ def _regions(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> dict[str, floa
     region = np.concatenate([_region_of_samples(s, top_speed, top_current) for s in signals])
     r2 = np.concatenate([np.sum([np.nan_to_num(sim.residual(c) / run.sigma[c]) ** 2 for c in run.sigma], axis=0)
                          for sim, run in zip(fit.simulations, fit.problem.runs, strict=True)])
-    total = float(np.sum(r2)) or 1.0
-    return {name: float(np.sum(r2[region == name])) / total for name in REGIONS}
+    return {name: float(np.sum(r2[region == name])) / (float(np.sum(r2)) or 1.0) for name in REGIONS}
 
 
 def _region_of_samples(s: Mapping[str, Array], top_speed: float, top_current: float) -> NDArray[np.str_]:

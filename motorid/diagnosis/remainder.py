@@ -549,8 +549,7 @@ def _forms_beside(fit: Fit) -> list[FormGain]:
 
 def _in_windows(fit: Fit) -> Fit | None:
     """Return a model that is far off, fitted in short windows."""
-    found: Fit | None = _once(lambda: over_moments(fit, solve=partial(solve, solver=QUICK)), fit, "windows")
-    return found
+    return _once(lambda: over_moments(fit, solve=partial(solve, solver=QUICK)), fit, "windows")
 
 
 def _without(fit: Fit, names: Iterable[str]) -> Fit | None:

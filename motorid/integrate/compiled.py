@@ -141,8 +141,7 @@ def _compiled(source: str, cc: Sequence[str], here: Path, to: Path) -> Path:
         finally:
             hangs.cancel()
     if process.returncode:
-        first = said.decode(errors="replace").splitlines() or ["no message"]
-        raise OSError(f"the C compiler failed ({first[0]})")
+        raise OSError(f"the C compiler failed ({(said.decode(errors='replace').splitlines() or ['no message'])[0]})")
     path = to / f"{_digest((here / 'step.so').read_bytes())}.so"
     to.mkdir(mode=0o700, exist_ok=True)
     os.replace(here / "step.so", path)

@@ -244,19 +244,24 @@ def _reach(y: Array, sigma: float) -> float:
 
 
 def _first_speed(theta: Array, t: Array, sigma: float) -> tuple[float, float]:
-    """Return the first speed and its reach, over the shortest window that noise leaves useful."""
+    """Return the first speed and its reach, over the shortest window that noise leaves useful; one that contradicts a
+    shorter one has a turn in it (Lepski, Theory Probab. Appl. 36(4), 1991)."""
     good = np.isfinite(theta)
     y, s = theta[good], t[good]
     if len(y) < 4:
         return 0.0, np.inf
     top = float(np.max(np.abs(window_slopes(t, theta)), initial=0.0))
-    w, longest = 1, max(len(y) // 50, 1)
-    while w < longest and np.sqrt(2) * sigma > 0.01 * top * (s[w] - s[0]):
-        w *= 2
-    noise = np.sqrt(2) * sigma / (s[w] - s[0])
-    pair = np.diff(y[[0, w, min(2 * w, len(y) - 1)]]) / np.diff(s[[0, w, min(2 * w, len(y) - 1)]])
-    gained = pair[1] - pair[0]
-    return float(pair[0] - gained / 2), float(REACH * noise + abs(gained))
+    found = list[tuple[float, float, float]]()
+    for w in 2 ** np.arange(max(len(y) // 50 - 1, 0).bit_length() + 1):
+        noise, ends = REACH * np.sqrt(2) * sigma / (s[w] - s[0]), [0, w, min(2 * w, len(y) - 1)]
+        first, then = (np.diff(y[ends]) / np.diff(s[ends])).tolist()
+        speed = first - (then - first) / 2
+        if any(abs(speed - other) > noise + more for other, more, _ in found):
+            break
+        found.append((speed, noise, noise + abs(then - first)))
+        if noise <= 0.01 * REACH * top:
+            break
+    return found[-1][0], float(found[-1][2])
 
 
 def natural_sizes(runs: Sequence[Experiment], values: Mapping[str, float]) -> dict[str, float]:

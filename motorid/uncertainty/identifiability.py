@@ -188,10 +188,9 @@ def identifiability(problem_or_fit: Problem | Fit, *, points: int = 5, seed: int
 def _structural_rank(problem: Problem, q: Array, points: int, seed: int) -> int:
     """Return the largest rank at `q` and at random points within a factor of three, noise not counting."""
     rng, k, best = np.random.default_rng(seed), len(problem.model.free_names), 0
-    reach = np.where(problem.scaling.log[:k], np.log(3.0), 0.5)
     for trial in range(points + 1):
         at = q.copy()
-        at[:k] += reach * rng.uniform(-1, 1, k) * (trial > 0)
+        at[:k] += np.where(problem.scaling.log[:k], np.log(3.0), 0.5) * rng.uniform(-1, 1, k) * (trial > 0)
         with suppress(SimulationError, np.linalg.LinAlgError), np.errstate(over="ignore", invalid="ignore"):
             jac = relative_jacobian(problem.refined(at), at)
             norms = np.linalg.norm(jac, axis=0)

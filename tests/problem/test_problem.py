@@ -310,6 +310,20 @@ def test_a_speed_of_half_the_largest_is_no_rest_however_noisy_the_sensor(rng):
     assert abs(begun.start[1] - 50) < 40
 
 
+def test_a_first_speed_is_not_looked_for_across_a_turn_of_the_motor():
+    """Of 100 lines it lay outside what the fit allowed, and a plain motor's angle showed 1.3 times its noise."""
+    t, line = np.arange(2000) * 2.4e-3, 2 * np.pi / 100
+    motor = mi.dc_motor(R=1.22, L=1.06e-3, K=0.247, b=1.5e-3, J=2.7e-3)
+    v = np.where(np.arange(2000) // 60 % 2, -9.0, 4.3)
+    clean = mi.simulate(motor, mi.Experiment(t, {"v": v}, dict.fromkeys(("omega", "theta"), 0 * t)), initial="rest")[0]
+    begin = 120 + int(np.argmin(np.abs(clean.outputs["omega"][120:180] + 9)))  # -9 rad/s, turning round
+    counts = line * np.floor(clean.outputs["theta"][begin:] / line)
+    run = mi.Experiment(t[begin:] - t[begin], {"v": v[begin:]}, {"theta": counts - counts[0]})
+    low, high = initial_state(run, {"theta": line / np.sqrt(12)}, "auto")[1]["omega"]
+    assert low < clean.outputs["omega"][begin] < high
+    assert mi.fit(mi.dc_motor(), run).misfit["theta"] < 1.1
+
+
 def test_a_record_that_begins_at_rest_may_do_so_however_few_counts_tell_its_first_speed(rng):
     """A quick start under 256 counts a turn: the speed that the first counts suggest is no limit."""
     t = 2e-3 * np.arange(3000)
