@@ -111,7 +111,7 @@ _PUSHES = (  # words, balance, carrier, quantities
     ("a load", "torque", "", ("turn", "theta", "t", "run")),
     ("a drag", "torque", "omega", ("t", "distance", "turn", "theta", "i", "run", "past speed", "past power",
                                  "past heat")),
-    ("a windage", "torque", "windage", ("t", "theta")),
+    ("a windage", "torque", "fan", ("t", "theta")),
     ("a torque", "torque", "", ("omega", "i")),
     ("an inertia", "torque", "acceleration", ("turn", "theta", "run", "omega", "most i")),
     ("a transient from each run's initial state, or an inertia", "torque", "acceleration", ("t",)),
@@ -129,7 +129,7 @@ FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quanti
          *(Form("an error of the current sensor", "sensor", on, "", "i") for on in ("i", "v", "omega", "t", "turn")),
          *(Form("a loss of voltage", "voltage", f"past {c}") for c in ("v", "i", "omega")),
          *(Form("a torque", "torque", on) for on in ("past i", "past omega", "path")),
-         *(Form("an error of the current sensor", "sensor", f"past {c}", "", "i") for c in ("i", "v")),
+         *(Form("an error of the current sensor", "sensor", f"past {c}", "", "i") for c in ("i", "v", "heat")),
          *(Form("an error of the speed sensor", "sensor", f"past {c}", "", "omega") for c in ("omega", "i")))
 
 
@@ -512,7 +512,7 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
         found["energy"] = 0.5 * fit.values["J"] * omega**2
         gone = np.cumsum(0.5 * np.abs(omega[1:] + omega[:-1]) * np.diff(run.t))  # both directions counted
         found["path"], found["distance"] = found["direction"], np.concatenate([[0.0], gone])
-        found["past speed"], found["past power"], found["windage"] = np.abs(omega), omega**2, omega * np.abs(omega)
+        found["past speed"], found["past power"], found["fan"] = np.abs(omega), omega**2, omega * np.abs(omega)
     if "i" in found:
         found["load"] = found["past load"] = found["v"] * found["i"]
         found["most i"] = np.maximum.accumulate(np.abs(found["i"]))

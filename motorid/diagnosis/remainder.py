@@ -62,14 +62,14 @@ QUANTITIES = {"run": "0.0", "turn": "m.theta",
 STATES = {  # quantities that are states of the curve's own: name, where it begins, rate
     "t": ("clock", "0.0", "1.0"), "distance": ("distance", "0.0", "ca.fabs(m.omega)"),
     "most i": ("most_i", "ca.fabs(m.start['i'])", "ca.fmax(ca.fabs(m.i) - most_i, 0) / {step}")}
-SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V", "load": "W", "windage": "rad²/s²"}
+SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V", "load": "W", "heat": "A²", "fan": "rad²/s²"}
 OTHER_PLACES = {"1": "where it sets in, a share of the largest", "V": "half of its play", "A": "half of its play",
                 **dict.fromkeys(("V/s", "rad/s²"), "how fast it rises or follows"),
                 "rad/s": "how fast it swings, or half of its play", "1/rad": "how fast it turns over",
                 "1:wave": "how many to the turn", "rad:phase": "its phase", "rad:wide": "half of its width",
                 "rad:edge": "how wide its edges are", "1:damped": "how much its swing is damped",
                 "rad:slip": "how far it slips until what it drags along follows"}
-OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad", "rad²/s²": "·s²/rad²"}
+OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad", "rad²/s²": "·s²/rad²", "A²": "/A²"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
 CLIPPED = re.compile(r"ca\.fmin\(ca\.fmax\(z, \S+\), \S+\)")
 MEMORY = re.compile(r"((past|play|ramp|slew|hold|drag|swing|sway)\(z, (.*?)\))")
@@ -87,7 +87,7 @@ FOLLOWS = {"play": "what a play of {} either way takes", "ramp": "what it is ahe
            "past": "one lag of {}", "swing": "a swing at {}", "sway": "a swing at {}"}
 POSITIVE = "ca.fmax(curve, -0.5) - 0.25 / ca.fmin(curve, -0.5) - 0.5"  # above -1, smooth; from -0.5 on as it is
 CARRIERS = {"": "", "direction": "m.sign(m.omega) * ", "omega": "m.omega * ", "i": "m.i * ", "v": "m.v * ",
-            "windage": "m.omega * ca.fabs(m.omega) * "}
+            "fan": "m.omega * ca.fabs(m.omega) * "}
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,8 @@ def speed_delay(m: Equations,
 
 
 @effect(balance="sensor")
-def speed_average(m: Equations, T_a=P(5e-3, "s", null=0.0, positive=True, grid=(2.0, 6.0, 20.0), doc="window of mean")):
+def speed_average(m: Equations, T_a=P(5e-3, "s", null=0.0, positive=True, grid=(2.0, 6.0, 20.0), pole=True,
+                                      doc="window of mean")):
     """Averaging of the speed over a window (counts), Padé of orders 2 and 3. Golub & Van Loan, 2013, sec. 9.3.
 
     Seen as straight flanks that come late after reversals."""

@@ -906,3 +906,19 @@ def test_what_leads_and_is_refused_gives_its_values_to_a_simpler_one_that_lost_t
     found = next(c for c in children if c.added == "stribeck")
     assert not found.objection
     assert found.fit.values["tau_s"] == pytest.approx(0.18, rel=0.03)
+
+
+@pytest.mark.parametrize(("window", "effects"), [(0.12, ("speed_average",)), (0.0, ())])
+def test_an_average_is_found_with_the_speed_alone_though_the_winding_took_it_up(window, effects):
+    """Its refit was left after a few steps, L/R being 40 ms still, and a lag beside an elastic shaft were named."""
+    rng, t, runs = np.random.default_rng(1), 4e-3 * np.arange(2500), []
+    motor = mi.dc_motor(R=0.87, L=4.4e-4, K=0.0168, b=6.8e-6, J=1.73e-5)
+    for _ in range(3):
+        v = np.repeat(rng.uniform(-9, 9, 25), 100) * (t > 0.02)
+        mean = np.convolve(v, np.ones(n := round(window / 4e-3) or 1) / n)[: len(v)]
+        clean = mi.simulate(motor, mi.Experiment(t, {"v": mean}, {"omega": 0 * t}), initial="rest")[0]
+        noise = 3 * rng.standard_normal(len(t))
+        runs.append(mi.Experiment(t, {"v": v}, {"omega": clean.outputs["omega"] + noise}))
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:2]), runs[2])
+    assert found.effects == effects
+    assert found.after.misfit["omega"] < 1.1

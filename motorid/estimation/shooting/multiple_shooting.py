@@ -137,9 +137,8 @@ class MultipleShooting:
     def _with_refinement(self, problem: Problem, q: Array) -> Solved:
         """Solve, refine the sub-steps at the solution, and again while they do not suffice."""
         mesh = Mesh(problem if problem.fine_enough(q) else problem.refined(q), self.every)
-        nodes = nodes_from_data if self.warm == "data" else nodes_from_simulation
         try:
-            z = mesh.joined(q, nodes(mesh, q))
+            z = mesh.joined(q, (nodes_from_data if self.warm == "data" else nodes_from_simulation)(mesh, q))
         except SimulationError:
             z = mesh.joined(q, nodes_from_data(mesh, q))
         done = self._solve(mesh, z)
