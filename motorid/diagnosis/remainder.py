@@ -508,8 +508,8 @@ class Remainder:
         """The same on whole `_records`, where the fit is of parts: what was before each is not known there."""
         if not (runs := whole_of(self.fit, self._records)):
             return None
-        fit, root = (f and _once(partial(fitted_to, f, runs, QUICK), f, "whole") for f in (self.fit, self._root))
-        return replace(self, fit=fit, _root=root, forms=misspecification.in_turn(_forms_beside(fit)), _records=())
+        fit, *root = (_once(partial(fitted_to, f, runs, QUICK), f, "whole") for f in (self.fit, self._root) if f)
+        return replace(self, fit=fit, _root=root[0] if root else None, forms=_forms_beside(fit), _records=())
 
     def _tried(self) -> Iterator[tuple[Curve, Form]]:
         """Yield models and a form to fit with each, the likeliest first; what takes a fit to find only when asked for.
@@ -543,8 +543,8 @@ def _once(find: Callable[[], Any], *key: Any) -> Any:
     return known[key]
 
 
-def _forms_beside(fit: Fit) -> list[FormGain]:
-    return list(_once(lambda: better_forms(fit, fit), fit, "forms"))
+def _forms_beside(fit: Fit) -> tuple[Form, ...]:
+    return misspecification.in_turn(_once(lambda: better_forms(fit, fit), fit, "forms"))
 
 
 def _in_windows(fit: Fit) -> Fit | None:
@@ -574,7 +574,7 @@ def _beyond(base: Fit | None) -> Iterator[tuple[Curve, Form]]:
     """Yield a model, without a curve yet, with each form that predicts more than it does, the best first."""
     if base is not None:
         with contextlib.suppress(*FAILURES):
-            yield from _over_zeros(base, misspecification.in_turn(_forms_beside(base)))
+            yield from _over_zeros(base, _forms_beside(base))
 
 
 def _over_zeros(base: Fit, forms: Iterable[Form]) -> Iterator[tuple[Curve, Form]]:
