@@ -222,8 +222,7 @@ def own_effects(path: Path) -> dict[str, Effect]:
     if not path.is_file():
         raise UsageError(f"--effects-from: there is no file {path}.")
     name = f"motorid_own_{path.stem}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
+    if (spec := importlib.util.spec_from_file_location(name, path)) is None or spec.loader is None:
         raise UsageError(f"--effects-from: {path} is not a Python file (*.py).")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # the laws are looked up there when a model goes to another process

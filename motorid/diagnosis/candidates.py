@@ -394,8 +394,7 @@ class Search:
     def in_place(self, node: Node, old: str, new: str, known: bool = False) -> Node | None:
         """Return the judged model with an effect where another was, only if met where `known`; None for none."""
         effects = {e.name: e for e in (*self.effects, *node.fit.model.effects)}
-        model = _in_place(node.fit.model, effects[old], effects[new])
-        if model is None or known:
+        if (model := _in_place(node.fit.model, effects[old], effects[new])) is None or known:
             return self.nodes.get(frozenset(model.effect_names)) if model else None
         return self.smaller(node, model)
 

@@ -320,8 +320,7 @@ def _optimised(task: Task, say: Callable[[str], None]) -> Found:
 def _judged(task: Task) -> Task:
     """Return the task without the pairs that no fixed candidate distinguishes, if there are others."""
     kept = [_shrunk(task, c) for c in _followed(task.layout, (0.0,)).values()] if task.pairs else []
-    every = [task.layout.of(k[0]) for k in kept if k is not None]
-    if not every:
+    if not (every := [task.layout.of(k[0]) for k in kept if k is not None]):
         return task
 
     def hopeless(task: Task) -> frozenset[tuple[int, int]]:
@@ -560,8 +559,7 @@ def _fixed(task: Task) -> tuple[str, Found]:
     ms = _whole(max(1, round(sum(old.ms) / FINE)), old.dt)
     n = round(sum(old.ms) / ms)
     fine = task.laid(replace(old, ms=(ms,) * n, bits=(ms,) * n, mixing=None))
-    starts = _best_first({n: _within(fine, c) for n, c in _followed(fine.layout, (0.0,)).items()})
-    if not starts:
+    if not (starts := _best_first({n: _within(fine, c) for n, c in _followed(fine.layout, (0.0,)).items()})):
         raise FitError(NO_RECORD)
     return next(iter(starts.items()))
 

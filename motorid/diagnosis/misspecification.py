@@ -132,8 +132,7 @@ def chosen_functions(fit: Fit, linear: Linear, form: Form, chosen_before: Iterab
     is no function of its own. The waves of a narrow dip help only together, so sets are passed as long as one function
     more takes what no noise would give to the best of so many (Donoho & Johnstone, Biometrika 81(3), 1994)."""
     answers = Answers(fit, linear, form)
-    before = answers.predictions(())
-    if before is None:
+    if (before := answers.predictions(())) is None:
         return []
     best = tuple[int, ...](), before
     sets, passed = [best], list(_pursued(answers, list(chosen_before)))
@@ -214,8 +213,7 @@ def grades_of(last: Node, root: Node, groups: Sequence[Sequence[str]], beside: S
         why = why or ("it may only stand in for the driver's current limit" if limited else "")
         why = why or ("the model does not follow the records with it" if structure and not follows(last.fit) else "")
         why = why or _insignificant(last, e, structure, root, without) or _within_smoothing(last.fit, e)
-        smaller = without(e.name) if not why and (structure or far(last.fit)) else None
-        if smaller is not None:
+        if (smaller := without(e.name) if not why and (structure or far(last.fit)) else None) is not None:
             free = [b for b in beside if not compare(b.predictions, beside[0].predictions).sure]
             free = [b for b in free if (differs(last.fit, b.form, e) or 0.0) > TRIFLE]
             free = free or better_forms(smaller.fit, last.fit)
@@ -296,13 +294,18 @@ def _insignificant(last: Node, effect: Effect, structure: bool, root: Node,
     return ""
 
 
+def sample_of(fit: Fit) -> float:
+    """Return the time between samples of the records as they were read, s."""
+    run = fit.problem.experiments[0]
+    return float(np.median(np.diff(run.t))) / run.meta.get("every", 1)
+
+
 def _half_a_sample(fit: Fit, effect: Effect) -> bool:
     """Tell whether an effect makes the speed late by half a sample of the records, or the mean over each predicts as
     well in its place, whatever lag the winding, the rotor and the noise of counts then share out among them."""
     if effect.name not in LATENESS:
         return False
-    run, name, share = fit.problem.experiments[0], effect.parameters[0].name, LATENESS[effect.name]
-    half = 0.5 * float(np.median(np.diff(run.t))) / run.meta.get("every", 1)
+    half, name, share = 0.5 * sample_of(fit), effect.parameters[0].name, LATENESS[effect.name]
     late, unsure = share * fit.values[name], STANDARD_ERRORS * share * (fit.std.get(name) or 0.0)
     if abs(late - half) < max(TRIFLE * half, min(unsure, half)):
         return True

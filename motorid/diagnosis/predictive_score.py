@@ -166,8 +166,7 @@ def _log_rms(errors: Errors, left_out: int = -1) -> float:
 
 def _differences(old: Channels, new: Channels) -> Array:
     """Return the difference of log densities per block, summed over channels."""
-    both = [c for c in old if c in new]
-    if not both:
+    if not (both := [c for c in old if c in new]):
         return np.zeros(0)
     count = 1 + max(int(b.max()) for c in both for b in old[c].blocks)
     total, seen = np.zeros(count), np.zeros(count, bool)

@@ -28,7 +28,7 @@ from motorid.diagnosis.record_versions import fitted_to, whole_of
 from motorid.diagnosis.refit import copies_the_angle, refit
 from motorid.diagnosis.thresholds import CONTAINED, TRIFLE
 from motorid.display.numbers import listed, number, percent
-from motorid.effects import PER_RUN
+from motorid.effects import LIBRARY, PER_RUN
 from motorid.errors import ModelError, OutOfTime, UsageError, looked_at
 from motorid.estimation.fit import over_moments, solve
 from motorid.estimation.least_squares import FAILURES
@@ -276,6 +276,8 @@ class Curve:
                  f"{percent(miss, 2)} of it)." for text, miss in self.nearest()[:1]]
         if "encoder_zero" in self.fit.model.effect_names:
             known.append("    To add with mi.effects.encoder_zero: the angle has another zero in every run.")
+        if "T_a" in self.fit.values:
+            known.append(f"    To add with mi.effects.speed_average, T_a = {self.fit.values['T_a']:.6g} s.")
         return "\n".join(["import casadi as ca", "", "import motorid as mi", "", "",
                           f'@mi.effect(balance="{self.balance}")', f"def {self.name}(", "    m,", *pars, "):",
                           f'    """What is left of the misfit: {self.text}.', *(["", *known, ""] if known else []),
@@ -329,8 +331,7 @@ class Curve:
             others = zip(sorted(set(last.problem.unknowns.firsts))[1:], own, strict=True)
             start = {f"{self.name}_{len(self.values)}[{k}]": size - first for k, size in others}
             return curve.refitted(last, curve.sizes | start, curve.sizes)
-        more = chosen_functions(last, linear, part.form, part.chosen, first=part.moved)
-        if not more:
+        if not (more := chosen_functions(last, linear, part.form, part.chosen, first=part.moved)):
             return None
         free = map(float, free_forms.form_coefficients(last, linear, part.form, more))
         *_, (_, sizes, places) = self._apart(self.values)
@@ -639,11 +640,25 @@ def _predicting_most(fit: Fit, tried: Iterable[tuple[Curve, Form]], held: HeldOu
     """Return the curve, fitted with its model, that predicts most beyond `fit`; None where none does."""
     before, name = held.predictions(fit), _name(fit)
     best = _better_curve(((replace(curve, name=name), form) for curve, form in tried), before, held)
+    best = best and _of_counts(best, held)
     for _ in range(FURTHER):
         if best is None or best.done or (larger := _better_curve(_further(best), best.predictions, held)) is None:
             break
         best = _revised(larger, held)
     return best and _slimmed(best, held)
+
+
+def _of_counts(best: Grown, held: HeldOut) -> Grown:
+    """Return a curve beside a speed that is the mean over each sample, as that of counts is, if it predicts better."""
+    fit, last = best.curve.fit, best.curve.fitted
+    if last and "omega" in fit.problem.outputs and not misspecification.LATENESS.keys() & {*fit.model.effect_names}:
+        with contextlib.suppress(*FAILURES, ModelError, OutOfTime):
+            mean = (fit.model + LIBRARY["speed_average"]).fix(T_a=misspecification.sample_of(fit))
+            base = _once(lambda: refit(fit, mean, (last.values,)), fit, "counts")
+            curve = base and replace(best.curve, fit=base).refitted(last, best.curve.sizes)
+            if curve and curve.fitted and compare(best.predictions, known := held.predictions(curve.fitted)).worth_it:
+                return Grown(best.gained, known, curve)
+    return best
 
 
 def _slimmed(best: Grown, held: HeldOut) -> Grown:
@@ -668,8 +683,7 @@ def _revised(best: Grown, held: HeldOut, times: int = FURTHER) -> Grown:
     for k, part in enumerate(best.curve.parts[:-1] if times else ()):
         with contextlib.suppress(*FAILURES, OutOfTime):
             check_time()
-            smaller = best.curve.without(k)
-            if smaller is None or smaller.fitted is None:
+            if (smaller := best.curve.without(k)) is None or smaller.fitted is None:
                 continue
             less = Grown(best.gained, held.predictions(smaller.fitted), smaller)
             if not compare(less.predictions, best.predictions).worth_it:

@@ -168,8 +168,7 @@ def score(tangent: Tangent, effect: Effect) -> Score:
 
 def _scored(tangent: Tangent, effect: Effect, shapes: "tuple[Shape, ...]") -> Score:
     """Score an effect by what it adds at several shapes."""
-    pairs = sorted(((_tried(tangent, s), s) for s in shapes), key=lambda pair: -pair[0].drop)
-    if not pairs:
+    if not (pairs := sorted(((_tried(tangent, s), s) for s in shapes), key=lambda pair: -pair[0].drop)):
         return Score(effect, 0.0, ({},))
     tried = [t for t, _ in pairs]
     best, shapes = tried[0], tuple(s for _, s in pairs)
@@ -184,8 +183,7 @@ def _score_orders(tangent: Tangent, added: "Added", effect: Effect) -> Score:
     """Score an effect of the angle at its likely orders, which the misfit without its colour tells."""
     lines = likely_lines(tangent, effect, ORDERS_TRIED)
     order = next(p.name for p in added.pars if p.order)
-    shape = added.shape({order: lines[0].order, **lines[0].choice}) if lines else None
-    if shape is None:
+    if (shape := added.shape({order: lines[0].order, **lines[0].choice}) if lines else None) is None:
         return Score(effect, 0.0, ({},))
     best, starts = _tried(tangent, shape), tuple(line.values(added.pars) for line in lines)
     out = spectrum(tangent, effect).stands_out

@@ -72,8 +72,7 @@ def _solve(rows: list[tuple[Array, Array]], names: "list[str | Load]", held: Map
     """Non-negative least squares with some coefficients known; zeros of the motor become small positive numbers."""
     a, b = np.vstack([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
     known = {n: held[n] for n in names if n in held}
-    free = [n for n in names if n not in held]
-    if not free:
+    if not (free := [n for n in names if n not in held]):
         return known
     b = b - a[:, [n in held for n in names]] @ np.array([*known.values()])
     a = a[:, [n not in held for n in names]]

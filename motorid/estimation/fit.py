@@ -254,8 +254,7 @@ def no_worse_than_smaller(found: Estimate, asked: Problem, effort: LevenbergMarq
             weak = {n: NEXT_TO_NOTHING * value for n, value in fresh.items() if n in vanishing}
             there = end.onward.tuned(width=problem.width, engine=problem.engine)
             starts = [there.for_model(problem.model.start_at(end.values | fresh | size)) for size in ({}, weak)]
-            again = race(starts, effort, solve=by_continuation)
-            if again is not None and again.cost < found.cost:
+            if (again := race(starts, effort, solve=by_continuation)) is not None and again.cost < found.cost:
                 found = replace(again, history=found.history + again.history)
     return found
 

@@ -151,8 +151,7 @@ def _compiled(source: str, cc: Sequence[str], here: Path, to: Path) -> Path:
 def load(path: Path, sizes: tuple[int, ...]) -> tuple[Any, Any] | None:
     """Return walks over a record, and in half the steps, by the library at `path`; None (said once) if that fails."""
     mark = mark_of(f"{DRIVER}{DRIVER_FLAGS}", "driver")
-    driver = mark and (find(mark) or build(DRIVER, mark, *DRIVER_FLAGS))
-    if not driver:
+    if not (driver := mark and (find(mark) or build(DRIVER, mark, *DRIVER_FLAGS))):
         return None
     try:
         step, walks = ctypes.CDLL(str(path)), _driver(str(driver))

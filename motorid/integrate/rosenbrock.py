@@ -219,8 +219,7 @@ class Stepper:
                 self._refused = True
                 cc.say_once("motorid: no C compiler found; using CasADi's virtual machine, same results, slower.")
                 return None
-            path = cc.find(mark)
-            if path is None and (compiled or self._spent > PATIENCE):
+            if (path := cc.find(mark)) is None and (compiled or self._spent > PATIENCE):
                 path = cc.build(cc.generate(self.functions), mark)
                 self._refused = path is None
             if path is not None:

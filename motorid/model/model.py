@@ -235,8 +235,7 @@ def _known_of(structure: Any) -> list[Any]:
 def _once(model: Model, make: Callable[..., Any], *more: Any) -> Any:
     """Return ``make(model, *more)``, made once for all models whose equations are the same: values are no part."""
     laws = tuple((e.name, e.law) for e in model.effects)
-    slot = _known_of((make, model.base, laws, tuple(model.parameters), model.angle_input, *more))
-    if not slot:
+    if not (slot := _known_of((make, model.base, laws, tuple(model.parameters), model.angle_input, *more))):
         slot.append(make(model, *more))
     return slot[0]
 

@@ -45,8 +45,7 @@ def plot_runs(runs: Sequence[Experiment] | Experiment, channels: Sequence[str] |
     --------
     >>> axes = mi.plot_runs(runs)
     """
-    every = [runs] if isinstance(runs, Experiment) else list(runs)
-    if not every:
+    if not (every := [runs] if isinstance(runs, Experiment) else list(runs)):
         raise UsageError("plot_runs needs at least one run: mi.plot_runs(mi.read_runs('run*.csv')).")
     shown = every[:COLUMNS]
     names = list(channels or ["v", *(c for c in CHANNELS if any(c in r.outputs for r in shown))])
@@ -334,8 +333,7 @@ def plot_current_limit(*results: Fit | Formulations, limit: float | None = None,
         raise UsageError("plot_current_limit takes fits of the same runs: mi.plot_current_limit(fit, hard, limit=8.0).")
     positive(limit=limit)
     relations = (c for f in fits for c in (*f.problem.constraints, *f.problem.penalties))
-    limit = limit or next((c.limit for c in relations if isinstance(c, CurrentLimit)), None)
-    if limit is None:
+    if (limit := limit or next((c.limit for c in relations if isinstance(c, CurrentLimit)), None)) is None:
         raise UsageError("no CurrentLimit in these fits; say which one to draw: mi.plot_current_limit(fit, limit=8.0).")
     if not all("i" in s.outputs for f in fits for s in f.simulations):
         raise UsageError("these fits have no current: it was not measured, or the model has none.")
@@ -431,8 +429,7 @@ def _errors(ax: Axes, shown: Sequence[tuple[str, Any, str]]) -> None:
 
 def _walk(ax: Axes, result: Formulations) -> None:
     ax.set(xlabel="weight of the penalties", ylabel="distance from the hard fit (%)", title="Heavier penalties")
-    points = [(p.weight, 100 * p.distance) for p in result.path if p.distance > 0]
-    if not points:
+    if not (points := [(p.weight, 100 * p.distance) for p in result.path if p.distance > 0]):
         ax.text(0.5, 0.5, "no path", transform=ax.transAxes, ha="center", color=style.MUTED)
         return
     ax.loglog(*zip(*points, strict=True), "o-", ms=4, color=style.CYCLE[1])

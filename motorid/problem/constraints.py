@@ -243,8 +243,7 @@ class SteadyState(Relation):
         return tuple(found)
 
     def _parts(self, problem: Any) -> tuple[Part, ...]:
-        segments = self.segments(problem)
-        if not segments:
+        if not (segments := self.segments(problem)):
             warnings.warn("SteadyState: no steady part was found in these records, so it asks for nothing. Name "
                           "the parts, SteadyState(at=[(run, begin, end)]), or leave it out.", stacklevel=4)
         return tuple(part for s in segments if (part := self._part(problem, s)) is not None)
@@ -254,8 +253,7 @@ class SteadyState(Relation):
         # The voltage and the torque balance need what was measured; at standstill friction is anything.
         electrical, current = "i" in system.states, "i" in s.means
         wanted = (electrical and current and s.v != 0, s.moving and "omega" in s.means and (current or not electrical))
-        names = [n for n, w in zip(("voltage", "torque"), wanted, strict=True) if w]
-        if not names:
+        if not (names := [n for n, w in zip(("voltage", "torque"), wanted, strict=True) if w]):
             return None
         pick = np.unique(np.linspace(s.first, s.last, min(FEWEST, s.n)).round().astype(int))
         one = np.ones(len(names))

@@ -91,8 +91,7 @@ class Problem:
         if self.model.axis == "rotary" and self.linear:
             object.__setattr__(self, "model", self.model.on_linear_axis())
         self.model.check_visible(self.outputs)
-        width = self.width or first_width(self.experiments, self.model.parameters)
-        if width is not None:
+        if (width := self.width or first_width(self.experiments, self.model.parameters)) is not None:
             object.__setattr__(self, "model", self.model.start_at({"sgn_width": width}))
 
     @cached_property

@@ -138,8 +138,7 @@ class Unknowns:
     def of_run(self, at: Point, k: int) -> Point:
         """Return `at` with the parameters that run `k` has for itself."""
         first = len(self.free) + len(self.initial)
-        mine = [(n, j) for j, (n, run, _) in enumerate(self.apart, first) if run == self.firsts[k]]
-        if not mine:
+        if not (mine := [(n, j) for j, (n, run, _) in enumerate(self.apart, first) if run == self.firsts[k]]):
             return at
         rows, columns = [self.system.parameters.index(n) for n, _ in mine], [j for _, j in mine]
         p, dp = at.p.copy(), at.dp.copy()

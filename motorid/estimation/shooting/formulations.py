@@ -74,8 +74,7 @@ class Formulations(Shown):
 
     def _rows(self) -> list[Sequence[Cell]]:
         fits = [f.fit for f in self.all]
-        first = next((f for f in fits if f is not None), None)
-        if first is None:
+        if (first := next((f for f in fits if f is not None), None)) is None:
             return []
         model, units = first.problem.model, units_of(first.problem.experiments)
         rows: list[Sequence[Cell]] = [[n, *(value_cell(f.values[n], f.std[n], model.parameters[n].unit) if f else NONE
