@@ -119,7 +119,9 @@ def choose(children: Sequence[Node], parent: Node) -> tuple[Node, list[Node]] | 
         near = [n for n in near if _price(n) == min(map(_price, near))]
         least = min(1 - evidence(parent, n).fall for n in near)  # no equal leaves plainly more, however unsure that is
         near = [n for n in near if (1 - PLAIN) * (1 - evidence(parent, n).fall) <= least]
-        chosen = min(near, key=lambda n: (rarity(n.added), -evidence(parent, n).gain))
+        added = {n.added for n in near}
+        wider = {e.name for n in near for e in n.fit.model.effects if e.name == n.added and added & {*e.includes}}
+        chosen = min(near, key=lambda n: (n.added in wider, rarity(n.added), -evidence(parent, n).gain))
     laws = _laws_as_good(chosen, children, parent)
     best = choose(laws, parent) if laws else None
     return best[0] if best else chosen, ordered

@@ -59,8 +59,8 @@ def adequate_text(judged: Adequacy, ranking: Sequence[Candidate], last: Fit) -> 
 def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades: Sequence[Grade], like: str,
                      remaining: Adequacy, curve: str = "", *, errors: Mapping[str, float] | None = None,
                      whole: bool = True, done: bool = True) -> str:
-    """Return the answer when something is missing that the library does not have; `curve`: what it does as one, which
-    leads where it leaves, with these `errors`, next to nothing of what all effects leave.
+    """Return the answer when something is missing that the library does not have; `curve`: what it does as one. That
+    leads where it leaves, with these `errors`, next to nothing of what effects leave that together come close.
 
     Not `whole`: only some effects were asked for. Not `done`: the search was stopped before all of these were tried."""
     none = "no effect of the library" if whole else "none of the effects asked for"
@@ -73,14 +73,14 @@ def unexplained_text(ranking: Sequence[Candidate], rungs: Sequence[Rung], grades
     if grades:
         near, share, nearest = _nearest(rungs, grades, ranking)
         whole_share = share_removed(*(r.validation_nrmse or r.nrmse for r in (rungs[0], rungs[-1])))
-        if not near and whole_share > MOST and grades[1:]:
+        last = rungs[-1].validation_nrmse or rungs[-1].nrmse
+        led = errors and errors.keys() >= moving(last).keys() and share_removed(last, errors) > UNCONTESTED
+        if not near and whole_share > MOST and grades[1:] and not led:
             titles, share = listed([_titled(rungs[-1].fit, g.effect) for g in grades]), whole_share
             near = f"{titles}, which together remove {percent(share, 2)} of the squared error"
         better = f"; better still is {like}, which {none} describes" if like else ""
-        last = rungs[-1].validation_nrmse or rungs[-1].nrmse
-        led = share_removed(last, errors) > UNCONTESTED if errors and errors.keys() >= moving(last).keys() else False
-        lead, near = (f"Unexplained, but close to {near}{better}.", "") if near and done and share > MOST and not led \
-            else (lead, near and f"Nearest: {near}.")
+        lead, near = (f"Unexplained, but close to {near}{better}.", "") if near and done and share > MOST else (
+            lead, near and f"Nearest: {near}.")
         helps = approximations_text([g for g in grades if g not in nearest or not g.why.startswith("it removes")])
         for form in (g.form for g in grades if g.form):  # in few words, and another may lead when fitted
             helps = helps.replace(IN_ITS_PLACE.format(form.text), "a free curve predicts better")
