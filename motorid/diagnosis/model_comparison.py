@@ -10,6 +10,7 @@ import numpy as np
 
 from motorid.diagnosis.predictive_score import Evidence, HeldOut, Predictions, compare, finer
 from motorid.diagnosis.thresholds import FINER, LARGER, MOST, PLAIN, SEARCHED, TRIFLE
+from motorid.effects import LIBRARY
 from motorid.estimation.fit import follows
 from motorid.estimation.result import Fit
 from motorid.model.model import Model
@@ -119,8 +120,8 @@ def choose(children: Sequence[Node], parent: Node) -> tuple[Node, list[Node]] | 
         near = [n for n in near if _price(n) == min(map(_price, near))]
         least = min(1 - evidence(parent, n).fall for n in near)  # no equal leaves plainly more, however unsure that is
         near = [n for n in near if (1 - PLAIN) * (1 - evidence(parent, n).fall) <= least]
-        added = {n.added for n in near}
-        wider = {e.name for n in near for e in n.fit.model.effects if e.name == n.added and added & {*e.includes}}
+        added = {n.added for n in near if n.added in LIBRARY}
+        wider = {name for name in added if name and added & {*LIBRARY[name].includes}}
         chosen = min(near, key=lambda n: (n.added in wider, rarity(n.added), -evidence(parent, n).gain))
     laws = _laws_as_good(chosen, children, parent)
     best = choose(laws, parent) if laws else None
