@@ -309,6 +309,8 @@ def _half_a_sample(fit: Fit, effect: Effect) -> bool:
     late, unsure = share * fit.values[name], STANDARD_ERRORS * share * (fit.std.get(name) or 0.0)
     if abs(late - half) < max(TRIFLE * half, min(unsure, half)):
         return True
+    if "speed_average" in fit.model.without(effect.name).effect_names:
+        return False
     model = (fit.model.without(effect.name) + LIBRARY["speed_average"]).fix(T_a=2 * half)
     other = otherwise(None, FAILURES, lambda: solve(fit.problem.with_(model=model), QUICK))
     both = [f and predictive_score.predictions_left_out(f) for f in (other, fit)]

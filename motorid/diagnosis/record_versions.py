@@ -272,10 +272,10 @@ def better_reading(fit: Fit, late: bool = False, earlier: bool = False) -> Readi
 
 def _best_delay(fit: Fit, earlier: bool = False) -> list[Reading]:
     """Return the delay that lowers the error most after a few steps, tried ever more closely; nothing for little."""
-    falls, best = {0.0: 0.0}, 0.0
+    falls, best, every = {0.0: 0.0}, 0.0, fit.problem.experiments[0].meta.get("every", 1)
     dt = float(np.median(np.concatenate([np.diff(r.t) for r in fit.problem.experiments])))
     for moves in DELAYS:
-        samples = [n for move in moves if -1 <= (n := round(best + move, 6)) < (0 if earlier else np.inf)]
+        samples = [n for move in moves if -1 / every <= (n := round(best + move, 6)) < (0 if earlier else np.inf)]
         falls |= {n: _fall(fit, delay_of(n * dt)) for n in samples if n not in falls}
         best = max(falls, key=lambda n: falls[n])
     return [delay_of(best * dt)] if falls[best] > PROMISING else []

@@ -353,8 +353,8 @@ class Curve:
         there are none of these, or that fails."""
         parts, values, std = list[Part](), list[float](), self.fitted.std if self.fitted else {}
         for part, sizes, places in self._apart(self.sizes.items()):
-            told = [abs(c) > 2 * (std.get(n) or 0.0) for n, c in sizes]
-            kept = [k for k, known in enumerate(told) if known or part.by_run or not any(told)]
+            told = [(known := std.get(n, 0.0)) is not None and abs(c) > 2 * known for n, c in sizes]
+            kept = [k for k, sure in enumerate(told) if sure or part.by_run or not any(told)]
             ends = np.cumsum([0, *part.counts])
             parts.append(replace(part, chosen=tuple(part.chosen[k] for k in kept)))
             values += [sizes[k][1] for k in kept] + [c for k in kept for _, c in places[ends[k] : ends[k + 1]]]
@@ -826,8 +826,10 @@ def _closed_forms(on: str, z: Array) -> list[tuple[str, Sequence[Array]]]:
     top = float(np.abs(z).max(initial=0.0)) or 1.0
     if on == "turn":
         return [(f"one wave, {k} to the turn", [np.sin(k * z), np.cos(k * z)]) for k in range(1, 13)]
-    if on in ("theta", "t"):
-        return [("a constant", [one]), ("a straight line", [one, z]), ("its square", [z**2]), ("its cube", [z**3])]
+    if on in ("theta", "t", "distance"):
+        found = [("a constant", [one]), ("a straight line", [one, z]), ("its square", [z**2]), ("its cube", [z**3])]
+        return found + [(f"a constant and what fades within {number(c, 2)} {'s' if on == 't' else 'rad'}",
+                         [one, np.exp(-z / c)]) for c in np.geomspace(0.01, 2, CLOSED) * top if on != "theta"]
     found = [("a constant", [one]), ("proportional to it", [z]), ("proportional to its size", [np.abs(z)]),
              ("its sign alone", [side]), ("its square, with its sign", [z * np.abs(z)]),
              ("its sign and proportional to it", [side, z])]

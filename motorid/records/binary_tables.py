@@ -38,8 +38,7 @@ def mat_table(data: bytes) -> TextTable:
             found = scipy.io.loadmat(io.BytesIO(data), simplify_cells=True)
         except Exception as error:  # a damaged file makes loadmat fail in every way there is
             raise DataError(f"it cannot be read as a MATLAB file ({_first_line(error)}).") from None
-    arrays = dict(_arrays("", {k: v for k, v in found.items() if not k.startswith("__")}))
-    if not arrays:
+    if not (arrays := dict(_arrays("", {k: v for k, v in found.items() if not k.startswith("__")}))):
         raise DataError(f"it holds no numeric arrays of at least {MIN_SAMPLES} samples.")
     lengths = Counter(len(a) for a in arrays.values())
     length = max(lengths, key=lambda n: (lengths[n], n))

@@ -747,8 +747,7 @@ def _speed_cosine(run: Experiment) -> float:
     """Return the cosine of the integral of the voltage and the travel, where no speed was measured.
 
     Against a spring the angle itself follows the voltage: if only where it has come to rest under several of them."""
-    theta = run.outputs.get("theta")
-    if theta is None or len(edges := _block_edges(theta)) < 6:
+    if (theta := run.outputs.get("theta")) is None or len(edges := _block_edges(theta)) < 6:
         return 0.0
     v, angle = run.inputs["v"], bridged(run.t, theta)
     begins = np.r_[0, np.flatnonzero(np.abs(np.diff(v)) > 0.02 * np.ptp(v)) + 1, run.n]

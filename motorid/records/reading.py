@@ -149,8 +149,7 @@ def find_records(paths: Path_ | Iterable[Path_]) -> list[Path]:
 
 def _expand(path: Path) -> list[Path]:
     if path.is_dir():
-        found = [f for f in path.iterdir() if _is_record(f)]
-        if not found:
+        if not (found := [f for f in path.iterdir() if _is_record(f)]):
             raise DataError(f"the directory {path} holds no records ({', '.join(RECORDS)}).")
         return sorted(found, key=_natural)
     if path.exists():
@@ -169,8 +168,7 @@ def _what_is_there(folder: Path, wanted: str | None = None) -> str:
         return "The working directory does not exist any more."
     if not folder.is_dir():
         return f"Its folder {folder} does not exist, either; the working directory is {Path.cwd()}."
-    names = sorted((f.name for f in folder.iterdir() if f.is_dir() or _is_record(f)), key=str.lower)
-    if not names:
+    if not (names := sorted((f.name for f in folder.iterdir() if f.is_dir() or _is_record(f)), key=str.lower)):
         return f"There are no records in {folder.absolute()}."
     if wanted:
         return one_of(wanted, names[:12], "file").removeprefix(f"unknown file '{wanted}'. ")

@@ -61,8 +61,7 @@ def parse_table(data: bytes) -> TextTable:
     body = [line for line in lines if not line.lstrip().startswith(_COMMENT)]
     body = [b[:-1] if (b := row.rstrip()).endswith(";") and ";" not in b[:-1] and {*b} & {*",\t "} else row
             for row in body]  # what ends a statement, and no cell
-    body = body and _unnamed(body, notes)
-    if not body:
+    if not (body := body and _unnamed(body, notes)):
         raise DataError("it holds no rows" + (", only comments." if comments else "; the file is empty."))
     cells = len(re.findall(r"[\t;, ]+", body[len(body) // 2]))
     if cells > MOST_COLUMNS:
@@ -176,8 +175,7 @@ def is_data(cells: list[str], dialect: Dialect, width: int) -> bool:
 def _header(above: list[str], comments: list[str], dialect: Dialect, width: int,
             notes: list[str]) -> tuple[list[str], list[str]]:
     """Column names and the row of units from the lines above the numbers, or from the last comment line."""
-    rows = [_names(line, dialect, width) for line in above]
-    if not rows:
+    if not (rows := [_names(line, dialect, width) for line in above]):
         named = [_names(c.lstrip("#%/ "), dialect, width) for c in comments]
         if fitting := [row for row in named if len(row) == width and not any(map(dialect.is_number, row))]:
             return unique_labels(fitting[-1]), []

@@ -851,10 +851,13 @@ def test_an_average_takes_the_place_of_a_filter_of_two_numbers_once_all_is_found
 
 
 @pytest.mark.parametrize("earlier", [True, False])
-def test_a_voltage_acts_no_more_than_a_sample_earlier(monkeypatch, earlier):
-    """A row may hold a command and what that led to; a housing that swings was "4.7 ms earlier" at 2 ms."""
-    fit = SimpleNamespace(problem=SimpleNamespace(experiments=[SimpleNamespace(t=0.002 * np.arange(9))]))
-    monkeypatch.setattr(parts, "_fall", lambda fit, reading: 0.5 - 10 * reading.delay)
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_voltage_acts_no_more_than_a_sample_earlier(monkeypatch, earlier, every):
+    """A row may hold a command and what that led to; a housing that swings was "4.7 ms earlier" at 2 ms, a ramp of the
+    driver "5.4 ms earlier" at 3, of which the diagnosis looked at every second sample."""
+    runs = [SimpleNamespace(t=0.002 * every * np.arange(9), meta={"every": every})]
+    fit = SimpleNamespace(problem=SimpleNamespace(experiments=runs))
+    monkeypatch.setattr(parts, "_fall", lambda fit, reading: -100 * reading.delay)
     assert [r.delay for r in parts._best_delay(fit, earlier)] == [-0.002]
 
 

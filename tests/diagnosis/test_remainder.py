@@ -298,6 +298,32 @@ def test_the_nearest_closed_form_is_the_hidden_one(outside):
     assert shares == sorted(shares)
 
 
+@pytest.mark.parametrize(("on", "unit"), [("t", "s"), ("distance", "rad")])
+def test_what_fades_is_a_closed_form(on, unit):
+    """Of a field coil that was switched on with each run "a straight line, misses 58 %" was the nearest."""
+    z = np.linspace(0.0, 3.0, 500)
+    found = {text: remainder._closed(text, functions, 0.07 * np.exp(-z / 0.4) - 0.01, np.ones_like(z), "V")[1]
+             for text, functions in remainder._closed_forms(on, z)}
+    nearest = min(found, key=found.__getitem__)
+    assert nearest == f"a constant and what fades within 0.4 {unit}"
+    assert found[nearest] < 0.01 < 0.2 < min(found["a straight line"], found["its cube"])
+
+
+def test_a_function_whose_size_no_record_tells_leaves_the_curve(lab, monkeypatch):
+    """A constant beside K is K's own: of 1e-8 ± anything, it stayed in the curve of a field coil."""
+    rng = np.random.default_rng(3)
+    run = record(driven(lab, {}, "steps", 800, 1e-3, rng), "logger", ("i", "omega"), lab, rng, "steps")
+    fit = mi.fit(mi.dc_motor(), run)
+    part = Part.of(fit, Form("a motor constant", "both", "t"), moved=True)
+    fade, one = (next(k for k, f in enumerate(free_forms.functions_of(part.form, part.span)) if start in f)
+                 for start in ("exp", "1.0"))
+    place = replace(part, chosen=(fade,)).places[0][0]
+    both = Curve(fit, (replace(part, chosen=(fade, one)),), (1e-3, 1e-4, place)).refitted(
+        fit, {"remainder_0": 1e-3, "remainder_1": 1e-4, "remainder_2": place})
+    monkeypatch.setattr(type(fit), "std", {"remainder_0": 1e-9, "remainder_1": None})
+    assert both.slimmed().parts[0].chosen == (fade,)
+
+
 def test_the_size_of_a_closed_form_is_that_where_its_carrier_is():
     """A gain of the voltage is anything while there is none: a driver that waits was "at most 1500"."""
     gain, v = np.array([-1.0, -1.0, 1500.0, 0.0, -1.0]), np.array([2.0, -3.0, 0.0, 0.0, 1.0])
