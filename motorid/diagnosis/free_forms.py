@@ -5,7 +5,7 @@ kinks at zero for what has a sign; for what remembers, first-order lags of many 
 fading memory (Laguerre and Kautz models: Wahlberg, IEEE Trans. Automatic Control 36(5), 1991)."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from types import SimpleNamespace
@@ -48,11 +48,14 @@ KNEES = 9  # of a speed, current or voltage of either sign, beyond which somethi
 BOTH_WAYS = 0.5  # of the larger side that the smaller one reaches at least: both are known alike
 FINER = 4  # times as many places and knees in a curve that is fitted: what is narrow stands between the few
 WHERE = {"torque": "mechanical", "transmission": "mechanical", "voltage": "electrical", "both": "electrical",
-         "sensor": "sensor"}
+         "coupling": "mechanical", "load": "mechanical", "sensor": "sensor"}
+LOADS = {"load": "r_load", "geared": "r_gap", "slip": "r_slip", "free": "r_free"}  # end of its states' names, its share
+COUPLED = ("twist", "slip", "load speed")  # what is known of the load where the model has one
 CHANGES = {"t": "changes with the time", "distance": "changes with the distance run",
            "turn": "changes with the angle within a turn", "theta": "changes with the angle",
            "omega": "changes with the speed", "i": "changes with the current", "v": "changes with the voltage",
-           "load": "changes with the power drawn", "run": "differs from run to run",
+           "load": "changes with the power drawn", "twist": "changes with its twist", "slip": "changes with its slip",
+           "load speed": "changes with the speed of that", "run": "differs from run to run",
            "past i": "depends on the current before", "past omega": "depends on the speed before",
            "past v": "depends on the voltage before", "path": "depends on the distance since a reversal",
            "past speed": "depends on how fast it ran before", "past power": "depends on how fast it ran before",
@@ -121,6 +124,8 @@ _PUSHES = (  # words, balance, carrier, quantities
     ("a resistance", "voltage", "i", ("t", "turn", "theta", "omega", "load", "run", "past heat", *COMPUTED_INPUTS)),
     ("a motor constant", "both", "", ("t", "turn", "theta", "omega", "i", "run", "past i", "past size", "most i")))
 FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quantities in _PUSHES for on in quantities),
+         *(Form("a torque of the coupling to the load", "coupling", on) for on in COUPLED[:2]),
+         Form("a torque on the load behind its coupling", "load", "load speed"),
          *(Form("a gain of the speed sensor", "sensor", on, "omega", "omega") for on in ("turn", "t", "i")),
          *(Form("a gain of the current sensor", "sensor", on, "i", "i") for on in ("t", "past heat")),
          *(Form("an error of the angle sensor", "sensor", on, "", "theta")
@@ -145,6 +150,7 @@ class Span:
     rates: Mapping[str, Sequence[float]] = field(default_factory=dict)  # of waves over the time, rad/s, or the angle
     pitches: int = 1
     unscaled: tuple[str, ...] = ()  # channels the gain of whose sensor the motor's own parameters make up
+    load: str = ""  # of `LOADS`
 
 
 def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
@@ -168,7 +174,13 @@ def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
         rates["theta"] = [w for w in found if abs(w - round(w)) * travel > 2 * np.pi]
     free, moving = set(fit.problem.model.free_names), len({"omega", "theta"} & {*fit.problem.outputs})
     unscaled = tuple(c for c, own in (("i", "RLbJ"), ("omega", "KbJ")) if free >= {*own} and (c == "i" or moving == 1))
-    return Span(ranges, tuple(sorted(orders)), step, rates={n: w[:LINES] for n, w in rates.items()}, unscaled=unscaled)
+    return Span(ranges, tuple(sorted(orders)), step, rates={n: w[:LINES] for n, w in rates.items()}, unscaled=unscaled,
+                load=load_of(fit.problem.system.states))
+
+
+def load_of(states: Container[str]) -> str:
+    """Return which of `LOADS` a model has, none as an empty string."""
+    return next((name for name in LOADS if f"omega_{name}" in states), "")
 
 
 def _rates(fit: Fit, along: Sequence[Array], step: float) -> list[float]:
@@ -341,7 +353,7 @@ def _of_size(form: Form, span: Span, low: float, high: float) -> list[str]:
     if not low < 0 < high:
         return ["1.0", *smooth]
     smooth += [f"(ca.fmax({s} - {c}, 0) - ca.fmax(-{s} - {c}, 0))" for c in knees]  # the same either way
-    jumps = ["m.sign(z)" if form.on == "omega" else f"ca.tanh(z / {SOFT * top:.6g})"]
+    jumps = ["m.sign(z)" if form.on in ("omega", "load speed") else f"ca.tanh(z / {SOFT * top:.6g})"]
     if form.on == "load" and form.carrier == "i":  # braking takes small powers: the jump is far narrower than that
         jumps = [f"ca.tanh(ca.fmax({sign}{s}, 0) / {_place(SOFT, SOFT**2, 1)})" for sign in sides]
     return [*jumps, *smooth, f"{s} * {size}", "1.0", size, f"{size}**3", *(f"ca.tanh({size} / {b})" for b in bends)]
@@ -440,7 +452,7 @@ def basis_of(form: Form, signal: Mapping[str, Array], span: Span) -> Array:
     return functions * signal[form.carrier][:, None] if form.carrier else functions
 
 
-BALANCES = ("voltage", "torque")
+BALANCES = ("voltage", "torque", "load")
 STATES = {"torque": "omega", "voltage": "i"}  # whose rate a balance is
 NUDGE = 1e-3  # of a size
 _compiled = lru_cache(4096)(lambda f: compile(PLACE.sub(r"\1", f), "<form>", "eval"))  # every run asks for it
@@ -472,7 +484,8 @@ def linearised(fit: Fit, only: Form | None = None, span: Span | None = None,
     span = span or span_of(fit, signals)
     forms = [f for f in FORMS if shown(f, fit, span.ranges)] if only is None else [only]
     free, n, runs = len(problem.model.free_names), problem.n_outputs, range(len(signals))
-    seen = [replace(a, c=a.c * m.weights[:, None]) for a, m in zip(responses(fit), problem.measured, strict=True)]
+    seen = [replace(a, b=_with_load(fit, k, a), c=a.c * m.weights[:, None])
+            for k, (a, m) in enumerate(zip(responses(fit), problem.measured, strict=True))]
     own = jac[:n, free:] * [reach if np.isfinite(reach := 0.5 * (p.upper - p.lower)) else 1.0
                             for p in problem.unknown[free:]]
 
@@ -481,6 +494,17 @@ def linearised(fit: Fit, only: Form | None = None, span: Span | None = None,
 
     known = answer if only is None else {only: answer(only)}.__getitem__
     return Linear(residual[:n], jac[:n, :free], own, forms, known)
+
+
+def _with_load(fit: Fit, k: int, answer: Response) -> Array:
+    """Return what a voltage, a torque and one on the load push each state over a sample, (N-1, nx, 2 or 3)."""
+    states = fit.problem.system.states
+    if not (load := load_of(states)):
+        return answer.b
+    inertia = fit.values["J"] * max(fit.values[LOADS[load]], SHARP)
+    own = (np.eye(len(states)) + answer.a)[:, :, states.index(f"omega_{load}")]
+    own *= (0.5 * np.diff(fit.problem.experiments[k].t) / inertia)[:, None]
+    return np.concatenate([answer.b, own[:, :, None]], axis=2)
 
 
 def _at(problem: Problem, fit: Fit) -> tuple[Array, Array]:
@@ -511,6 +535,11 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
         found["acceleration"] = fit.values["J"] * np.gradient(omega, run.t)  # of a relative inertia
         found["energy"] = 0.5 * fit.values["J"] * omega**2
         gone = np.cumsum(0.5 * np.abs(omega[1:] + omega[:-1]) * np.diff(run.t))  # both directions counted
+        if load := load_of(sim.states):
+            found["load speed"] = np.asarray(sim.states[f"omega_{load}"])
+            found["slip"] = omega - found["load speed"]
+            if f"twist_{load}" in sim.states:
+                found["twist"] = np.asarray(sim.states[f"twist_{load}"])
         found["path"], found["distance"] = found["direction"], np.concatenate([[0.0], gone])
         found["past speed"], found["past power"], found["fan"] = np.abs(omega), omega**2, omega * np.abs(omega)
     if "i" in found:
@@ -548,7 +577,7 @@ def _answer(problem: Problem, k: int, seen: Response, form: Form, basis: Array) 
 
 def _pushes(form: Form, basis: Array, answer: Response) -> Array:
     """Return what a form's functions push on the states over each sample, (m, N-1, nx); only the voltage jumps."""
-    shares = {form.balance: basis}
+    shares = {"torque": -basis, "load": basis} if form.balance == "coupling" else {form.balance: basis}
     if form.balance == "both":
         shares = {"voltage": -answer.states["omega"][:, None] * basis, "torque": answer.states["i"][:, None] * basis}
     held = form.on in ("v", *COMPUTED_INPUTS) or form.carrier == "v"

@@ -20,7 +20,7 @@ import numpy as np
 
 from motorid.channels import COMPUTED_INPUTS, worded
 from motorid.diagnosis import free_forms, misspecification
-from motorid.diagnosis.free_forms import FINER, PAST, PLACE, WHERE, Form, Span
+from motorid.diagnosis.free_forms import COUPLED, FINER, LOADS, PAST, PLACE, WHERE, Form, Span, load_of
 from motorid.diagnosis.misspecification import FormGain, better_forms, chosen_functions, pitches_of, tells_the_zero
 from motorid.diagnosis.model_comparison import Node, at_noise, far
 from motorid.diagnosis.predictive_score import QUICK, Evidence, HeldOut, Predictions, compare
@@ -56,19 +56,22 @@ INPUT_AT_ONCE = 80  # but not of an input, which jumps at samples only
 QUANTITIES = {"run": "0.0", "turn": "m.theta",
               "theta": "m.theta", "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v",
               "past i": "m.i", "past omega": "m.omega", "past speed": "ca.fabs(m.omega)", "past power": "m.omega**2",
+              "twist": "m.twist_{load}", "slip": "m.omega - m.omega_{load}", "load speed": "m.omega_{load}",
               "path": "m.sign(m.omega)", "load": "m.v * m.i", "past load": "m.v * m.i",
               "past braking": "ca.fmax(-m.v * m.i, 0)", "past heat": "m.i**2", "past size": "ca.fabs(m.v)",
               **{c: f"m.input('{c}')" for c in COMPUTED_INPUTS}}
 STATES = {  # quantities that are states of the curve's own: name, where it begins, rate
     "t": ("clock", "0.0", "1.0"), "distance": ("distance", "0.0", "ca.fabs(m.omega)"),
     "most i": ("most_i", "ca.fabs(m.start['i'])", "ca.fmax(ca.fabs(m.i) - most_i, 0) / {step}")}
-SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V", "load": "W", "heat": "A²", "fan": "rad²/s²"}
+SI = {"theta": "rad", "omega": "rad/s", "i": "A", "v": "V", "size": "V", "load": "W", "heat": "A²", "fan": "rad²/s²",
+      "twist": "rad", "slip": "rad/s", "load speed": "rad/s"}
 OTHER_PLACES = {"1": "where it sets in, a share of the largest", "V": "half of its play", "A": "half of its play",
                 **dict.fromkeys(("V/s", "rad/s²"), "how fast it rises or follows"),
                 "rad/s": "how fast it swings, or half of its play", "1/rad": "how fast it turns over",
                 "1:wave": "how many to the turn", "rad:phase": "its phase", "rad:wide": "half of its width",
                 "rad:edge": "how wide its edges are", "1:damped": "how much its swing is damped",
                 "rad:slip": "how far it slips until what it drags along follows"}
+COUPLINGS = {"compliance", "backlash", "slip_clutch", "freewheel"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad", "rad²/s²": "·s²/rad²", "A²": "/A²"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
 CLIPPED = re.compile(r"ca\.fmin\(ca\.fmax\(z, \S+\), \S+\)")
@@ -153,14 +156,15 @@ class Part:
         """The same as source. Few functions are a law, which goes on, in a balance straight as R·i; of many nothing is
         known beyond."""
         terms = [PLACE.sub(r"\1", f) for f in self.placed(places)]
-        straight = [CLIPPED.sub("z", f) if self.moved and self.form.on in ("omega", "i", "v") else f for f in terms]
+        on_a_size = self.moved and self.form.on in ("omega", "i", "v", *COUPLED)
+        straight = [CLIPPED.sub("z", f) if on_a_size else f for f in terms]
         each = zip(terms, straight, strict=True)
         return [on if self.form.balance == "sensor" or "*" not in on else f for f, on in each]
 
     def unit(self, fit: Fit, bare: bool = False) -> str:
         """Unit of the coefficients, or `bare` of what the part adds to its balance or its sensor, but for a carrier."""
         form, torque = self.form, "N" if fit.model.axis == "linear" else "N·m"
-        own = {"torque": torque, "voltage": "V", "both": f"{torque}/A"}.get(form.balance, SI.get(form.channel, ""))
+        own = {"voltage": "V", "both": f"{torque}/A", "sensor": SI.get(form.channel, "")}.get(form.balance, torque)
         before = form.on.removeprefix("past ") if form.on in PAST and not form.carrier else ""
         by = [SI.get(n, "") for n in (before, form.carrier)]
         over = "".join(OVER[unit] for unit in by).replace("rad", "m" if torque == "N" else "rad")
@@ -171,7 +175,7 @@ class Part:
     def place(self) -> tuple[str, str]:
         """Unit of the places, and what they are."""
         on = self.form.on
-        if on in ("omega", "i", "v", "load"):
+        if on in ("omega", "i", "v", "load", *COUPLED):
             return "", f"where it bends, a share of {number(max(map(abs, self.span.ranges[on])), 4)} {SI[on]}"
         unit = "rad" if on in ("theta", "turn", "distance", "path") else "s"
         return unit, "how long it remembers" if on in PAST else "where it lies, bends, sets in or fades"
@@ -181,7 +185,7 @@ class Part:
         form, terms, own = self.form, self.terms(places), names[0]
         state, begins, rate = STATES.get(form.on, ("", "", ""))
         step = f"{self.span.step / (INPUT_AT_ONCE if form.on == 'past v' else AT_ONCE):.6g}"
-        lines = [f"z = {state or QUANTITIES[form.on]}"]
+        lines = [f"z = {state or QUANTITIES[form.on].format(load=self.span.load)}"]
         if state and form.on not in known:
             lines = [f"{state} = m.state('{own}_{state}', {begins})",
                      f"m.rate({state}, {rate.format(step=step)})", *lines]
@@ -209,6 +213,10 @@ class Part:
             return "\n".join([*lines, "m.scale('J', 1 + curve)"])
         if form.balance == "both":
             return "\n".join([*lines, "m.torque -= curve * m.i", "m.voltage += curve * m.omega"])
+        if form.balance in ("coupling", "load"):
+            there, inertia = self.span.load, f"(m.base('J') * m.base('{LOADS[self.span.load]}'))"
+            on_load = f"m.push('omega_{there}', {'-' * (form.balance == 'load')}curve / {inertia})"
+            return "\n".join([*lines, *["m.torque -= curve"] * (form.balance == "coupling"), on_load])
         carrier = CARRIERS[form.carrier]
         if form.balance == "sensor":
             return "\n".join([*lines, f"m.measure('{form.channel}', m.measured('{form.channel}') - {carrier}curve)"])
@@ -262,7 +270,8 @@ class Curve:
     @property
     def balance(self) -> str:
         """The balance of the effect."""
-        return self.parts[0].form.balance.replace("both", "voltage")
+        return {"both": "voltage", "coupling": "transmission", "load": "transmission"}.get(
+            balance := self.parts[0].form.balance, balance)
 
     @property
     def code(self) -> str:
@@ -501,7 +510,8 @@ class Remainder:
     def _grown(self) -> "Grown | None":
         """The same, as far as it has grown; None where none helps. Raises OutOfTime before there is any."""
         short = (t for root in [self._root or self.fit] for t in _grown_in(_in_windows(root), root, self.forms))
-        every = _by_turns(*(islice(some, TRIED) for some in (self._tried(), short, *map(_beyond, self._anew))))
+        sources = self._coupled(), self._tried(), short, *map(_beyond, self._anew)
+        every = _by_turns(*(islice(some, TRIED) for some in sources))
         return _predicting_most(self.fit, every, self._held or HeldOut.of(self.fit, None))
 
     @property
@@ -511,6 +521,18 @@ class Remainder:
             return None
         fit, *root = (_once(partial(fitted_to, f, runs, QUICK), f, "whole") for f in (self.fit, self._root) if f)
         return replace(self, fit=fit, _root=root[0] if root else None, forms=_forms_beside(fit), _records=())
+
+    def _coupled(self) -> Iterator[tuple[Curve, Form]]:
+        """Yield the model with a shaft or a clutch, whatever else only approximates left out, with what is known of the
+        load behind it; a shaft with play is one that stiffens, too."""
+        coupled = {e.name for e in self.fit.model.effects} & COUPLINGS
+        base = coupled and (_without(self.fit, self._approximating.keys() - coupled) or self.fit)
+        if base and "backlash" in coupled:
+            bare = reduce(Model.without, coupled, base.model)
+            start = {"r_load": base.values["r_gap"], "omega_r": base.values["omega_c"], "zeta_r": base.values["zeta_c"]}
+            base = _once(lambda: refit(base, bare + LIBRARY["compliance"], [base.values | start]), base, "shaft")
+        if base:
+            yield from ((curve, form) for curve, form in _beyond(base) if form.on in COUPLED)
 
     def _tried(self) -> Iterator[tuple[Curve, Form]]:
         """Yield models and a form to fit with each, the likeliest first; what takes a fit to find only when asked for.
@@ -783,6 +805,8 @@ def _name(fit: Fit) -> str:
 def _growing(curve: Curve, form: Form, moved: bool, before: Predictions, held: HeldOut) -> Iterator[Grown]:
     """Yield a curve with a form more, of ever more functions, as long as these help."""
     best, led = float("-inf"), None
+    if form.on in COUPLED and not load_of(curve.fit.problem.system.states):
+        return
     with contextlib.suppress(*FAILURES):
         for begun in dict.fromkeys((curve.begun.first or curve.begun, curve.begun)) if moved and curve.begun else ():
             there = {n: v for n, v in (begun.fitted or begun.fit).values.items() if n != "sgn_width"}

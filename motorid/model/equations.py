@@ -135,6 +135,12 @@ class Equations:
             raise ModelError(f"{self.writer}: the state '{name}' has a rate already; give it once, as one sum.")
         self.rates[name] = ca.SX(expression)
 
+    def push(self, state: str, expression: Any) -> None:
+        """Add to the rate of a state that an effect given before has added: a torque on the load, over its inertia."""
+        if state not in self.rates:
+            raise self._unknown(state, self.rates)
+        self.rates[state] += expression
+
     def measure(self, channel: str, expression: Any) -> None:
         """Set what the sensor of `channel` shows; build it on `measured` so that effects can follow."""
         self.measured(channel)

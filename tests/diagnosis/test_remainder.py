@@ -38,6 +38,7 @@ from motorid.diagnosis.locate import locate
 from motorid.diagnosis.misspecification import Grade
 from motorid.diagnosis.model_comparison import node_of
 from motorid.diagnosis.predictive_score import Evidence, HeldOut
+from motorid.diagnosis.refit import refit
 from motorid.diagnosis.remainder import Curve, Part, Remainder
 from motorid.errors import OutOfTime
 from motorid.estimation.fit import over_moments, solve
@@ -1225,6 +1226,35 @@ def _with_law(law, channels, lab, sizes=(1, 1, 1)):
         runs.append(run.with_(outputs={c: y + 0.005 * np.std(y) * rng.standard_normal(len(y))
                                        for c, y in clean.items()}))
     return runs, {c: 0.005 * np.std(y) / np.sqrt(np.mean(y**2)) for c, y in runs[2].outputs.items()}
+
+
+@mi.effect(balance="transmission")
+def rubbing_load(m, r_o=mi.P(0.5, ""), w_o=mi.P(150.0, "1/s"), tau_o=mi.P(8e-3, "N·m"), stiffer=mi.P(0.0, "1/rad²")):
+    """A load on a shaft, with dry friction of its own, or a shaft that stiffens."""
+    twist, omega = m.state("twist_o"), m.state("omega_o", m.start["omega"])
+    inertia = m.base("J") * r_o
+    carried = inertia * (1 - r_o) * (w_o**2 * twist * (1 + stiffer * twist**2) + 0.2 * w_o * (m.omega - omega))
+    m.rate(twist, m.omega - omega)
+    m.rate(omega, (carried - tau_o * ca.tanh(omega / 0.05)) / inertia)
+    m.scale("J", 1 - r_o)
+    m.torque -= carried
+
+
+@pytest.mark.parametrize(("law", "balance", "on", "closed"), [
+    (rubbing_load, "load", "load speed", "its sign"), (rubbing_load(tau_o=0, stiffer=10), "coupling", "twist", None)])
+def test_what_rubs_behind_a_shaft_and_a_shaft_that_stiffens_are_curves_of_the_load(law, balance, on, closed, lab):
+    """In blind trials neither was within four times the floor: no curve reached behind the shaft."""
+    runs, floor = _with_law(law, ("i", "omega"), lab, sizes=(1, 1, 0.7))  # no further than what was seen
+    fit = refit(plain := mi.fit(mi.dc_motor(), runs[:2]), plain.model + mi.effects.compliance, [
+        plain.values | {"r_load": 0.4, "omega_r": 120.0, "zeta_r": 0.1}])
+    held = HeldOut.of(fit, runs[2:])
+    left = Remainder("structure", fit, grades.in_turn(grades.better_forms(fit, fit)), held, plain)
+    left.as_effect()
+    first = left._best.curve.parts[0].form
+    assert (first.balance, first.on) == (balance, on)
+    errors = mi.evaluate(left.fitted, runs[2:]).nrmse
+    assert all(errors[c] < (1.1 if closed else 3) * floor[c] < mi.evaluate(fit, runs[2:]).nrmse[c] for c in floor)
+    assert closed is None or left.nearest()[0][0].startswith(closed)
 
 
 def test_nothing_follows_a_reversal_where_the_motor_never_turns_back(rng):

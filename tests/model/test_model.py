@@ -199,7 +199,7 @@ def test_circular_definitions():
         (mi.dc_motor() + a + b).system(("i",))
 
 
-@pytest.mark.parametrize("how", ["read", "scale", "replace", "measure"])
+@pytest.mark.parametrize("how", ["read", "scale", "replace", "push", "measure"])
 def test_unknown_quantities(how):
     def law(m, c=mi.P(1.0, "")):
         if how == "read":
@@ -208,12 +208,32 @@ def test_unknown_quantities(how):
             m.scale("Rr", c)
         elif how == "replace":
             m.replace("Rr", c)
+        elif how == "push":
+            m.push("omega_lod", c)
         else:
             m.measure("omegga", c * m.omega)
 
     effect = mi.effect(balance="torque", name="mistaken")(law)
     with pytest.raises(ModelError, match=r"mistaken.*(Did you mean|Known)"):
         mi.dc_motor() + effect
+
+
+def test_a_push_adds_to_the_rate_of_another_effect_s_state():
+    """A torque on the load behind a shaft, over its inertia."""
+    @mi.effect(balance="transmission")
+    def hung(m, tau=mi.P(1e-3, "N·m")):
+        m.push("omega_load", -tau / (m.base("J") * m.base("r_load")))
+
+    shaft = mi.dc_motor(R=1.0, L=1e-3, K=0.05, b=1e-5, J=2e-5) + mi.effects.compliance(r_load=0.4)
+    was, now = (model.system(("omega",)) for model in (shaft, shaft + hung))
+    values = {**shaft.values, "tau": 1e-3}
+    rates = [np.asarray(s.rhs(np.zeros(len(s.states)), np.zeros(1), [values[n] for n in s.parameters])).ravel()
+             for s in (was, now)]
+    changed = dict(zip(was.states, rates[1] - rates[0], strict=True))
+    assert changed.pop("omega_load") == pytest.approx(-1e-3 / (2e-5 * 0.4))
+    assert not any(changed.values())
+    with pytest.raises(ModelError, match="unknown quantity 'r_load'"):
+        mi.dc_motor() + hung
 
 
 def test_a_state_without_a_rate():
