@@ -56,8 +56,7 @@ def report(result: Any, path: str | Path, *, title: str = "", command: str = "",
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    results = list(result) if isinstance(result, list | tuple) else [result]
-    if not results:
+    if not (results := list(result) if isinstance(result, list | tuple) else [result]):
         raise UsageError("report needs a result: mi.report(mi.diagnose(fit), 'report.html').")
     for r in results:
         if not isinstance(r, Shown):

@@ -168,8 +168,7 @@ def identifiability(problem_or_fit: Problem | Fit, *, points: int = 5, seed: int
         given = any(p.given for p in problem_or_fit.model.parameters.values())
         begun = problem_or_fit if given else with_start_values(problem_or_fit)
         problem, q = begun.refined(begun.start), begun.start
-    names = problem.model.free_names
-    if not names:
+    if not (names := problem.model.free_names):
         raise UsageError("the model has no free parameter; free some with model.free(…).")
     k = len(names)
     matrix = relative_jacobian(problem, q)

@@ -61,8 +61,7 @@ def multistart(problem_or_fit: Problem | Fit, *, starts: int = 100, spread: floa
     positive(spread=spread)
     began = time.perf_counter()
     reference = problem_or_fit if isinstance(problem_or_fit, Fit) else solve(problem_or_fit, solver)
-    names = reference.problem.model.free_names
-    if not names:
+    if not (names := reference.problem.model.free_names):
         raise UsageError("the model has no free parameter to start from; free some with model.free(…).")
     drawn = _draw(reference, names, starts, spread, seed)
     task = (reference.problem, dict(reference.values), solver, guess)
