@@ -213,8 +213,7 @@ def _fits(value: Any, annotation: str) -> bool:
     """Tell whether a value is of the kind that an annotation names; of lists and mappings, all that is in them."""
     for choice in _choices(annotation):
         name, _, inner = choice.removesuffix("]").partition("[")
-        name = name.rpartition(".")[2]
-        if name in ("Any", "object") or (name == "None" and value is None):
+        if (name := name.rpartition(".")[2]) in ("Any", "object") or (name == "None" and value is None):
             return True
         kind = _KINDS.get(name)
         known = (_is_number(value, name) if name in ("float", "int", "bool") else isinstance(value, kind) if kind

@@ -36,8 +36,7 @@ class Client:
 
     def keep_alive(self) -> None:
         """Tell the device, every 0.2 s, that somebody is listening."""
-        now = time.monotonic()
-        if now - self._spoken > KEEP_ALIVE:
+        if (now := time.monotonic()) - self._spoken > KEEP_ALIVE:
             self.link.write(frame("K"))
             self._spoken = now
 

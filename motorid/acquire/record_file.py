@@ -136,8 +136,7 @@ class Appender:
             self._trouble = error
 
     def _sync(self) -> None:
-        size = self._size
-        if size != self._synced:
+        if (size := self._size) != self._synced:
             os.fsync(self._fd)
             self._synced = size
 

@@ -218,8 +218,7 @@ def with_options(kind: type) -> Callable[[Callable[..., None]], Callable[..., No
 
 def own_effects(path: Path) -> dict[str, Effect]:
     """Return the effects defined in a Python file, by name; a UsageError if it cannot be run or defines none."""
-    path = Path(os.path.expanduser(path))
-    if not path.is_file():
+    if not (path := Path(os.path.expanduser(path))).is_file():
         raise UsageError(f"--effects-from: there is no file {path}.")
     name = f"motorid_own_{path.stem}"
     if (spec := importlib.util.spec_from_file_location(name, path)) is None or spec.loader is None:

@@ -130,8 +130,7 @@ def _dependences(fit: Fit, channel: str) -> list[dict[str, Any]]:
         signals, bins = [m[name] for m in motions], BINS
         if name == "theta":
             signals, bins = [np.mod(s, 2 * np.pi) for s in signals], 2 * BINS
-        edges = np.unique(np.quantile(np.concatenate(signals), np.linspace(0, 1, bins + 1)[1:-1]))
-        if edges.size:
+        if (edges := np.unique(np.quantile(np.concatenate(signals), np.linspace(0, 1, bins + 1)[1:-1]))).size:
             share, p = _shift_test([np.searchsorted(edges, s, side="right") for s in signals], residuals)
             found.append({"channel": channel, "on": NAMES[name], "share": share, "p": p})
     return found
@@ -140,8 +139,7 @@ def _dependences(fit: Fit, channel: str) -> list[dict[str, Any]]:
 def _shift_test(labels: Sequence[NDArray[np.intp]], residuals: Sequence[Array]) -> tuple[float, float]:
     """Return the share of variance that bins explain beyond chance, and its p-value against shifted residuals."""
     count = int(max(lab.max() for lab in labels)) + 1
-    total = sum(float(r @ r) for r in residuals)
-    if total <= 0:
+    if (total := sum(float(r @ r) for r in residuals)) <= 0:
         return 0.0, 1.0
     sizes = sum(np.bincount(lab, minlength=count) for lab in labels)
     sums = sum(_sums(lab, r, count) for lab, r in zip(labels, residuals, strict=True))
@@ -179,8 +177,7 @@ def _text(adequate: bool, channels: Mapping[str, Mapping[str, float]], material:
         return f"The errors ({sizes}) do not depend on the motion (false-alarm rate {100 * FALSE_ALARM:g} %).{colour}"
     if not material:
         return f"Something is missing: the errors ({sizes}) are too large for noise, even coloured noise."
-    worst = min(material, key=lambda t: (t["p"], -t["share"]))
-    if worst["channel"] is None:
+    if (worst := min(material, key=lambda t: (t["p"], -t["share"])))["channel"] is None:
         why = f"'{worst['on']}' is predicted to explain {100 * worst['share']:.0f} % of them"
     else:
         error = f"{channel_name(worst['channel'])} error"

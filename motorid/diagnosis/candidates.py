@@ -400,8 +400,7 @@ class Search:
 
     def smaller(self, node: Node, model: Model) -> Node | None:
         """Return the judged model, one that is contained in `node`'s; None where it is no model by itself."""
-        key = frozenset(model.effect_names)
-        if key not in self.nodes:
+        if (key := frozenset(model.effect_names)) not in self.nodes:
             values = {n: node.fit.values[n] for n in model.parameters if n in node.fit.values}
             new = [e for e in model.effects if e.name not in node.fit.model.effect_names]
             gone = [e for e in node.fit.model.effects if e.name not in model.effect_names]

@@ -294,8 +294,7 @@ class Driven:
     @staticmethod
     def of(rival: Rival, layout: Layout, errors: Mapping[str, float], angle: bool) -> "Driven":
         """Return it with one integration step per sample."""
-        system = rival.model.system({*errors, *(("theta",) if angle else ())})
-        if system.inputs != ("v",):
+        if (system := rival.model.system({*errors, *(("theta",) if angle else ())})).inputs != ("v",):
             raise UsageError(f"{rival.name}: a model with measured inputs ({', '.join(system.inputs[1:])}) cannot be "
                              "used to design an experiment: they are not known beforehand.")
         system = voltage_as_parameters(system)
@@ -405,8 +404,7 @@ def separation(truth: Driven, rival: Driven, levels: Array, ra: Response, rb: Re
             with contextlib.suppress(SimulationError):
                 ta, tb = (f.respond(levels, d, by_parameter=True)
                           for f, d in zip(both, np.split(trial, [k]), strict=True))
-                value = float(np.sum((ta.y - tb.y) ** 2) + trial @ prior[1] @ trial)
-                if value < chi2:
+                if (value := float(np.sum((ta.y - tb.y) ** 2) + trial @ prior[1] @ trial)) < chi2:
                     delta, chi2, ra, rb = trial, value, ta, tb
                     break
         if chi2 > (1 - SETTLED) * before:

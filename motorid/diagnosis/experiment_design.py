@@ -505,8 +505,7 @@ def _between(task: Task, values: Mapping[str, float], speeds: Sequence[float], b
     top = NEAR * min(task.limits["omega"][1], V / (K + R * b / K))
     unit, w, segments = _unit(task.layout), 0.0, []  # segments: ms, ms per bit, first and second level
     for share, length in zip(speeds, _split(task.layout, len(speeds)), strict=True):
-        need = 1e3 * J * abs(share * top - w) / (K * I)
-        if need < unit or length < unit:
+        if (need := 1e3 * J * abs(share * top - w) / (K * I)) < unit or length < unit:
             return None
         go = min(length, unit * round(need / unit))
         to = w + (share * top - w) * min(1.0, length / need)
@@ -541,8 +540,7 @@ def _shrunk(task: Task, c: Array, displaced: Sequence[Array] = (),
     for _ in range(30):
         reach = task.reach(task.layout.of(c), displaced or [np.zeros((1, len(d.rival.scale))) for d in task.driven])
         rooms = {s: task.room(s) for s in reach}
-        ratio = max(max(reach[s][0] / low, reach[s][1] / high) for s, (low, high) in rooms.items())
-        if ratio <= 1:
+        if (ratio := max(max(reach[s][0] / low, reach[s][1] / high) for s, (low, high) in rooms.items())) <= 1:
             return c, reach
         c = c * min(0.98, max(1 / ratio, 0.3))
     return None

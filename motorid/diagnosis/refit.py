@@ -71,8 +71,7 @@ def raced(fit: Fit, model: Model, starts: Sequence[Mapping[str, float]]) -> Race
         (start, along) for start in _own_starts(fit, model, starts) for along in sorted({angular, False})]
     first = BEGIN if len(entries) > FINISHED else RACE
     each = ((_begun(fit, models, start, along, first), along) for start, along in entries)
-    begun = [(done, along) for done, along in each if done is not None]
-    if not begun and any(starts):
+    if not (begun := [(done, along) for done, along in each if done is not None]) and any(starts):
         return raced(fit, model, ())
     begun.sort(key=lambda entry: entry[0].cost)
     ahead = begun[: max(-(-len(begun) // HALVING), FINISHED)]
@@ -331,8 +330,7 @@ def _refit_all(tasks: Sequence[Task], map_: Callable[..., Iterable[Any]],
     done = map_(_race_tournament, [(tasks[k], alone) for k in entered])
     races |= {k: race for k, race in zip(entered, done, strict=True) if race is not None}
     if races:
-        first = min(races, key=lambda k: races[k].cost + tasks[k].price)
-        if first not in found:
+        if (first := min(races, key=lambda k: races[k].cost + tasks[k].price)) not in found:
             found[first] = _finish((tasks[first], races[first]))
         if _quiet(found[first]) is not None:
             found.update(_beaten(tasks, {k: race.cost for k, race in races.items()}, first) | found)

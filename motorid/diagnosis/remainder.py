@@ -174,8 +174,7 @@ class Part:
     @property
     def place(self) -> tuple[str, str]:
         """Unit of the places, and what they are."""
-        on = self.form.on
-        if on in ("omega", "i", "v", "load", *COUPLED):
+        if (on := self.form.on) in ("omega", "i", "v", "load", *COUPLED):
             return "", f"where it bends, a share of {number(max(map(abs, self.span.ranges[on])), 4)} {SI[on]}"
         unit = "rad" if on in ("theta", "turn", "distance", "path") else "s"
         return unit, "how long it remembers" if on in PAST else "where it lies, bends, sets in or fades"
@@ -294,8 +293,7 @@ class Curve:
 
     def nearest(self) -> list[tuple[str, float]]:
         """Return closed forms beside the first part, the nearest first: in words with its size, the share missed."""
-        part = self.parts[0]
-        if part.by_run:
+        if (part := self.parts[0]).by_run:
             return []
         z, value = self.points
         forms, unit = _closed_forms(part.form.on, z), part.unit(self.fit)
@@ -375,8 +373,7 @@ class Curve:
         only tells the measured angle to follow itself."""
         model, every = self.fit.model + self.effect, [{**w, **s} for s in starts for w in (last.values, {})]
         key = last, self.fit, self.law, *(tuple(start.items()) for start in every)
-        done = _once(lambda: refit(last, model, every), *key)
-        if done is None or copies_the_angle(done.problem, done.q):
+        if (done := _once(lambda: refit(last, model, every), *key)) is None or copies_the_angle(done.problem, done.q):
             return None
         return replace(self, values=tuple(done.values[n] for n in self.sizes), fitted=done)
 
@@ -686,8 +683,7 @@ def _of_counts(best: Grown, held: HeldOut) -> Grown:
 def _slimmed(best: Grown, held: HeldOut) -> Grown:
     """Return a curve without functions that came to nothing, if it predicts as well so."""
     with contextlib.suppress(*FAILURES, OutOfTime):
-        slim = best.curve.slimmed()
-        if slim and slim.fitted:
+        if (slim := best.curve.slimmed()) and slim.fitted:
             predicted = held.predictions(slim.fitted)
             return best if compare(predicted, best.predictions).worth_it else Grown(best.gained, predicted, slim)
     return best

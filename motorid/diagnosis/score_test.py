@@ -107,8 +107,7 @@ def with_phase_per_run(fit: Fit, scores: Sequence[Score], zero: Effect) -> list[
             zeros = np.angle(waves * np.conj(waves[0])) / n
             wave = {shape.sizes[0].name: float(np.median(np.abs(waves))), phase.name: float(np.angle(waves[0]))}
             tried.append((drop, {**shape.values, **wave, **dict(zip(apart, zeros.tolist(), strict=True))}))
-        tried = sorted(tried, key=lambda t: -t[0])[:PER_RUN]
-        if tried and tried[0][0] > (1 + MORE) * s.drop:
+        if (tried := sorted(tried, key=lambda t: -t[0])[:PER_RUN]) and tried[0][0] > (1 + MORE) * s.drop:
             found.append(replace(s, drop=tried[0][0], starts=tuple(values for _, values in tried)))
     return found
 

@@ -237,8 +237,7 @@ def _better(children: Collection[Node], best: Node) -> tuple[Node, list[Node]] |
     takes the place of: a friction that is less at rest is a dry one, rounded. Where the score is sure of nothing, a
     plain fall of their error begins a ladder: at rest the density prefers what never moves."""
     better = [c for c in children if beats(c, best)]
-    plain = [] if better else [c for c in children if evidence(best, c).plain]
-    if plain and best.parent is None:
+    if (plain := [] if better else [c for c in children if evidence(best, c).plain]) and best.parent is None:
         plain.sort(key=lambda c: (bool(c.objection), -(evidence(best, c).held_out_fall or 0.0)))
         return plain[0], plain
     sound, did = [c for c in better if not c.objection], evidence(_path(best)[0], best).fall
@@ -357,8 +356,7 @@ def _read_late(found: Climb, records: Records, as_it_was: Records, climbed: Call
         again = late if len(found.path) == 1 or late.suited(last)[1] else None
     if again is not None:
         anew = climbed(again)
-        better = evidence(last, new := anew.path[-1])
-        if better.gain > 0 and better.fall > 0:
+        if (better := evidence(last, new := anew.path[-1])).gain > 0 and better.fall > 0:
             if reading and again.reading:
                 before = last.fit if again.reading is reading or own is None else own
                 again = replace(again, remarks=(*again.remarks[:-1], again.reading.remark(before, new.fit)))
@@ -375,8 +373,7 @@ def _read_and_climbed(fit: Fit, held_out: Sequence[Experiment] | None,
     if sum(e / max(records.fit.nrmse[c], 1e-300) - 1 for c, e in as_it_was.fit.nrmse.items()) > 0:
         as_it_was = records  # what was left out did not belie the model
     records = as_it_was.read(reading) if (reading := versions.better_reading(as_it_was.fit)) else as_it_was
-    found = climbed(records, early=True)
-    if found.misread is not None:
+    if (found := climbed(records, early=True)).misread is not None:
         better = evidence(found.path[-1], (anew := climbed(again := records.read(found.misread))).path[-1])
         if min(better.gain, better.fall) > 0:
             records, found = again, anew

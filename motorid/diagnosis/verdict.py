@@ -334,8 +334,7 @@ def outliers_remark(fit: Fit) -> str:
         parts = [s.residual(c) for s in fit.simulations if c in s.experiment.outputs]
         r = np.concatenate([p[np.isfinite(p)] for p in parts])
         kept = np.concatenate([despiked(p) for p in parts])
-        spikes = int(np.count_nonzero(r != kept))
-        if spikes and kept @ kept < (1 - SPIKED) * (r @ r):
+        if (spikes := int(np.count_nonzero(r != kept))) and kept @ kept < (1 - SPIKED) * (r @ r):
             share = percent(1 - float(kept @ kept) / float(r @ r), 2)
             turns = [(angle_signal(s.experiment)[known := np.isfinite(p)], p[known] != despiked(p)) for s, p in zip(
                 (s for s in fit.simulations if c in s.experiment.outputs), parts, strict=True)

@@ -171,8 +171,7 @@ def _laws(problem: Problem, values: Mapping[str, float]) -> dict[str, tuple[str,
         laws["damping"] = "", "damping ratio", lambda p: times(p)[0] / np.sqrt(times(p)[1])
     force = "N" if model.axis == "linear" else "N·m"
     for n in (p.name for e in model.effects for p in e.parameters):  # torques, and what makes one of speed or angle
-        p = model.parameters[n]
-        if p.unit.startswith(force):
+        if (p := model.parameters[n]).unit.startswith(force):
             words = f"{p.doc or n} as a {drive}, {'R·' * motor}{n}/{'K' if motor else 'g'}"
             laws[f"{n}_voltage"] = p.unit.replace(force, volt, 1), words, as_voltage(n)
     if model.effect_names in ((), ("coulomb",)):

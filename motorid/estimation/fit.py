@@ -266,8 +266,7 @@ def _reweighted(found: Estimate) -> dict[str, float] | None:
     (an encoder), at any price in the others. Noise and misfit together give the maximum of the likelihood
     with the channels' variances as unknowns, ``Σ n·ln(SSR)`` (Seber & Wild, Nonlinear Regression, 1989, ch.
     11); a model that reaches the noise keeps the weights of the noise."""
-    problem = found.problem
-    if problem.weights != "noise" or problem.loss is not None or len(problem.outputs) < 2:
+    if (problem := found.problem).weights != "noise" or problem.loss is not None or len(problem.outputs) < 2:
         return None
     factors = misfit_over_noise(problem, found.q)
     relative = [factors[c] / problem.noise_factors.get(c, 1.0) for c in factors]

@@ -64,8 +64,7 @@ def check(found: Fit | Model) -> Checked:
             return Checked(1e-3, 1, f"not checked, since the model cannot follow {what}.")
     dt = float(np.median(np.diff(records[0]["t"])))
     for m in (2**k for k in range(11)):
-        error = max(_error(functions, r, m) for r in records)
-        if error < ACCURATE:
+        if (error := max(_error(functions, r, m) for r in records)) < ACCURATE:
             break
     return Checked(dt, m, f"with {m} in {dt:.3g} s it differs from the model by at most {error:.2g} of the span, "
                           f"on {what}.")

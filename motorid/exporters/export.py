@@ -138,11 +138,9 @@ def load(path: str | os.PathLike[str], effects: Iterable[Effect] = (), *,
     >>> again.values == better.values
     True
     """
-    source = Path(os.path.expanduser(path))
-    if source.suffix.lower() in (".c", ".h"):
+    if (source := Path(os.path.expanduser(path))).suffix.lower() in (".c", ".h"):
         raise UsageError(f"{source.name} goes to other programs; load reads .json and .casadi files.")
-    data = read_bytes(source)
-    if data[:1] == b"{":
+    if (data := read_bytes(source))[:1] == b"{":
         try:
             contents = json.loads(data)
         except (ValueError, RecursionError) as error:
@@ -164,8 +162,7 @@ def _fit_of(contents: Mapping[str, Any], effects: Iterable[Effect], name: str) -
     try:
         told = contents["fit"]
         problem = problem_of(contents["model"], told["problem"], effects)
-        q = np.array(told["q"], float)
-        if q.shape != problem.start.shape:
+        if (q := np.array(told["q"], float)).shape != problem.start.shape:
             raise ValueError("q")
         residuals, jac = problem.residual_and_jacobian(q)
         extra = {k: tuple(Multiplier(**m) for m in v) if k in ("multipliers", "active") else np.array(v, float)

@@ -237,8 +237,7 @@ class System:
 def build_system(m: Equations, parameters: tuple[str, ...], outputs: tuple[str, ...],
                  stored: tuple[str, ...]) -> System:
     """Close the sheet `m` and return its `System`."""
-    electrical = "i" in m.states
-    if electrical:
+    if electrical := "i" in m.states:
         voltage = m.v - m.R * m.i - m.K_e * m.omega + m.voltage
         torque = m.K_t * m.i - m.b * m.omega + m.torque
     else:

@@ -201,8 +201,7 @@ class Model(Shown):
         chosen = tuple(c for c in CHANNELS if c in outputs)
         if "i" in chosen and "i" not in STATES[self.base]:
             raise ModelError(f"the base '{self.base}' has no current: leave the channel 'i' out, or use dc_motor().")
-        key = (chosen, self.stored)
-        if key not in self._systems:
+        if (key := (chosen, self.stored)) not in self._systems:
             self._systems[key] = _once(self, _system, *key)
         return self._systems[key]
 

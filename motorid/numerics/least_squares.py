@@ -214,8 +214,7 @@ def _reduce(jac: Array, r: Array) -> tuple[Array, Array]:
     if n > MANY:
         lots, one = ((rows, rows.any(axis=0)) for rows in np.split(full, range(ROWS, len(full), ROWS))), np.eye(n + 1)
         full = np.concatenate([np.linalg.qr(rows[:, acts], mode="r") @ one[acts] for rows, acts in lots])
-    full = np.asarray(np.linalg.qr(full, mode="r"))
-    if full.shape[0] < n:  # fewer residuals than unknowns
+    if (full := np.asarray(np.linalg.qr(full, mode="r"))).shape[0] < n:  # fewer residuals than unknowns
         full = np.vstack([full, np.zeros((n - full.shape[0], n + 1))])
     return full[:n, :n], full[:n, n]
 

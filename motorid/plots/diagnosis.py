@@ -90,8 +90,7 @@ def _binned(ax: Axes, b: Binned, signals: Sequence[Mapping[str, Array]], values:
             colour: str) -> None:
     x, y = np.concatenate([np.asarray(s[b.against]) for s in signals]), np.concatenate(list(values)) * factor
     x = np.mod(x, 2 * np.pi) if b.against == "theta" else x
-    ok = np.isfinite(x) & np.isfinite(y) & (x >= b.centre.min()) & (x <= b.centre.max())
-    if ok.any():
+    if (ok := np.isfinite(x) & np.isfinite(y) & (x >= b.centre.min()) & (x <= b.centre.max())).any():
         scatter(ax, x[ok], y[ok], most=800, color=style.MUTED)
     means(ax, b, factor, color=colour)
     ax.axhline(0, color=style.MUTED, lw=0.6)
@@ -173,8 +172,7 @@ def plot_ranking(result: Diagnosis | Sequence[Candidate], ax: Axes | None = None
     >>> axes = mi.plot_ranking(found)
     """
     every = result.ranking if isinstance(result, Diagnosis) else result
-    chosen = every[:show]
-    if not chosen or not all(isinstance(c, Candidate) for c in chosen):
+    if not (chosen := every[:show]) or not all(isinstance(c, Candidate) for c in chosen):
         raise UsageError("plot_ranking takes a diagnosis with a ranking: mi.plot_ranking(mi.diagnose(fit)).")
     ax = style.only(ax, width=6.4, height=0.6 + 0.3 * len(chosen))
     for k, c in enumerate(chosen):

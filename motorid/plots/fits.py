@@ -371,8 +371,7 @@ def _against_limit(ax: Axes, s: Simulation, limit: float) -> None:
 def _zoom(ax: Axes, simulations: Sequence[Simulation], limit: float) -> None:
     """Show the part of a record where the current comes near its limit, if that is a small part."""
     t = simulations[0].experiment.t
-    near = np.max([np.abs(s.outputs["i"]) for s in simulations], axis=0) > NEAR * limit
-    if not near.any():
+    if not (near := np.max([np.abs(s.outputs["i"]) for s in simulations], axis=0) > NEAR * limit).any():
         return
     first, last = t[near][0], t[near][-1]
     room = max(last - first, 10 * float(np.median(np.diff(t))))

@@ -214,8 +214,7 @@ def plot_waterfall(result: Multistart) -> np.ndarray:
 def _sorted_costs(ax: Axes, result: Multistart, ends: Sequence[tuple[StartResult, str]]) -> None:
     ratio = np.array([e.cost for e, _ in ends]) / min([result.reference.cost, *(e.cost for e, _ in ends)])
     for kind, (word, colour) in _KINDS.items():
-        where = np.flatnonzero([k == kind for _, k in ends])
-        if where.size:
+        if (where := np.flatnonzero([k == kind for _, k in ends])).size:
             ax.plot(where + 1, ratio[where], "o", ms=4, color=style.PALETTE[colour], label=word)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     words = f"{result.good} of {len(result.results)} agree"

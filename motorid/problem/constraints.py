@@ -356,8 +356,7 @@ class Constraint(Relation):
                 raise ModelError(f"{self.title}: its expression is no formula of {', '.join(symbols)} "
                                  f"({type(error).__name__}: {str(error).partition(chr(10))[0]}).") from None
 
-        rows_of = local(system, rows)
-        if rows_of.size1_out(0) != 1:
+        if (rows_of := local(system, rows)).size1_out(0) != 1:
             raise ModelError(f"{self.title}: the expression must be one number, not {rows_of.size1_out(0)}.")
         constant = not rows_of.jac_sparsity(0, 0).nnz() and not rows_of.jac_sparsity(0, 1).nnz()
         found = []

@@ -66,8 +66,7 @@ def _run_of(problem: Problem, record: Experiment, data: Mapping[str, Any]) -> Ru
     run = prepare_run(record, problem.outputs, data["sigma"], problem.system.inputs, "rest")
     limits = {c: (-np.inf if low is None else low, np.inf if high is None else high)
               for c, (low, high) in data["limits"].items()}
-    start = np.array(data["start"], float)
-    if start.shape != (3,):
+    if (start := np.array(data["start"], float)).shape != (3,):
         raise ValueError(f"3 numbers expected, {start.shape} came")
     return replace(run, grid=run.grid.with_substeps(steps), sigma=dict(data["sigma"]), limits=limits, start=start,
                    apart=dict(data["apart"]))
@@ -108,8 +107,7 @@ def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ())
         raise DataError(f"this is {what}: '{part}' is missing or wrong; expected model.base, "
                         "model.effects and parameters, each with a number as value, and fixed.") from None
     model = _assembled(head, effects)
-    missing = set(model.parameters) ^ set(values)
-    if missing:
+    if missing := set(model.parameters) ^ set(values):
         raise DataError(f"the parameters {', '.join(sorted(missing))} are in only one of the file and the model: an "
                         "effect has changed since the file was written.")
     for name, p in pars.items():

@@ -131,8 +131,7 @@ def _arrays(name: str, value: object, depth: int = 0) -> Iterator[tuple[str, np.
         return
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
         return
-    array = np.squeeze(value)
-    if array.ndim == 2 and min(array.shape) <= 64:
+    if (array := np.squeeze(value)).ndim == 2 and min(array.shape) <= 64:
         tall = array if array.shape[0] >= array.shape[1] else array.T
         for k in range(tall.shape[1]):
             yield from _arrays(f"{name}_{k + 1}", tall[:, k], depth)

@@ -119,8 +119,7 @@ def dead_times(runs: Sequence[Experiment]) -> list[float]:
             if min((a - first) // 2, end - a) < FEWEST_FRESH or max(np.ptp(v[first:a]), np.ptp(v[a:end])) > level:
                 continue
             turns = any(abs(np.median(y[last:a])) > STILL * np.abs(y).max() for y in seen.values())
-            ways = [_way(y[last:a], y[a:end]) for y in seen.values() if "i" in seen or turns]
-            if ways and all(ways):
+            if (ways := [_way(y[last:a], y[a:end]) for y in seen.values() if "i" in seen or turns]) and all(ways):
                 waits, comes = min(way for way in ways if way)
                 found.append(float(run.t[a + waits] - run.t[a]) if waits > comes - waits else 0.0)
     return found if all(found) else []
@@ -281,8 +280,7 @@ def current_limit(run: Experiment) -> str | None:
     if i is None or omega is None or run.units["v"] != "V" or _clipped(run):
         return None
     top = float(np.nanmedian(np.abs(i)[np.abs(i) >= 0.95 * np.nanquantile(np.abs(i), 0.995)]))
-    near = 4 * noise_level(i, run.t)
-    if near > 0.1 * top:
+    if (near := 4 * noise_level(i, run.t)) > 0.1 * top:
         return None
     ends = np.flatnonzero(np.diff((np.abs(np.abs(i) - top) < near).astype(int), prepend=0, append=0))
     clear = 0.2 * np.nanmax(np.abs(omega))  # no range with a missing sample is larger
@@ -329,8 +327,7 @@ def _spikes(run: Experiment) -> str | None:
     left = run.without_spikes()
     for channel, y in run.outputs.items():
         kept = np.isfinite(left.outputs[channel])
-        far = np.flatnonzero(np.isfinite(y) & ~kept)
-        if far.size:
+        if (far := np.flatnonzero(np.isfinite(y) & ~kept)).size:
             size = float(np.median(np.abs(y[far] - np.interp(run.t[far], run.t[kept], y[kept]))))
             return (f"{far.size} samples of the {NAMES[channel]} stand about {size:.2g} {run.units[channel]} "
                     "away from their neighbours: spikes of the sensor or the logger. Leave them out (--no-spikes, "
@@ -610,8 +607,7 @@ def implied_constants(run: Experiment) -> str | None:
     if not names or good.sum() < 20 or np.std(run.inputs["v"]) == 0:
         return None
     rows = np.column_stack([run.outputs[c][good] for c in names])
-    size = np.abs(rows).max(axis=0)
-    if not size.all() or np.linalg.cond(rows / size) > 100:
+    if not (size := np.abs(rows).max(axis=0)).all() or np.linalg.cond(rows / size) > 100:
         return None
     found = dict(zip(names, np.linalg.lstsq(rows, run.inputs["v"][good], rcond=None)[0], strict=True))
     K, R = found.get("omega", 1.0), found.get("i", 1.0)
@@ -672,8 +668,7 @@ def _as_balances_want(run: Experiment) -> Reading:
     shares = {r: balances.unexplained(*r) for r in readings}
     left = {r: (voltage + RESOLVED if "i" in known else 1.0) * float(np.sqrt((speed + RESOLVED) * (drive + RESOLVED)))
             for r, (voltage, speed, drive) in shares.items()}
-    best = min(left, key=lambda r: left[r])
-    if best[0] != stated[0]:
+    if (best := min(left, key=lambda r: left[r]))[0] != stated[0]:
         speed = balances.y[best[0][2]]  # one less its correlation with the next sample: of white noise 1, of a motion 0
         coarse = float(np.mean(np.diff(speed) ** 2) / max(2 * np.var(speed), 1e-300)) > ROUGH
         if not coarse and max(shares[best]) <= EXPLAINED and left[best] < CLEAR * left[stated]:

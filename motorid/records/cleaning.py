@@ -180,8 +180,7 @@ def _rows_in_order(t: Array, column: str, said: list[str]) -> tuple[NDArray[np.i
         total = used
     moving = [s[np.r_[True, t[s][1:] > np.maximum.accumulate(t[s])[:-1]]] for s in long]
     moving = [s for s in moving if len(s) >= MIN_SAMPLES] or moving[:1]
-    kept = sum(map(len, moving))
-    if kept < max(total / 2, MIN_SAMPLES):
+    if (kept := sum(map(len, moving))) < max(total / 2, MIN_SAMPLES):
         raise DataError(f"time stands still or goes back in {total - kept} of {total} rows of "
                         f"'{column}'. Is it the right column? If its clock is too coarse, leave "
                         "it out, and say the time between samples: dt=0.0002.")
@@ -221,8 +220,7 @@ def _runs_by_column(columns: Mapping[str, Any], rows: NDArray[np.intp], t: Array
 
 
 def _first_input(v: Array, column: str, said: list[str]) -> int:
-    known = np.flatnonzero(np.isfinite(v))
-    if not known.size:
+    if not (known := np.flatnonzero(np.isfinite(v))).size:
         raise DataError(f"every sample of the input '{column}' is missing; no simulation can do without it.")
     if known[0]:
         said.append(f"left out the first {counted(int(known[0]), 'row')}: the input '{column}' is not known there.")
@@ -230,8 +228,7 @@ def _first_input(v: Array, column: str, said: list[str]) -> int:
 
 
 def _filled(t: Array, v: Array, column: str, said: list[str]) -> Array:
-    missing = ~np.isfinite(v)
-    if not missing.any():
+    if not (missing := ~np.isfinite(v)).any():
         return v
     said.append(f"the input '{column}' is missing in {np.count_nonzero(missing)} of {len(v)} rows; "
                 "it was held from the last known value, or goes on evenly where a few are missing from what does.")

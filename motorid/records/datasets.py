@@ -40,8 +40,7 @@ def data_path(name: str = "") -> Path:
     >>> mi.data_path("hidden_friction/run1.csv").name
     'run1.csv'
     """
-    path = _root() / name
-    if not path.exists():
+    if not (path := _root() / name).exists():
         files = sorted(f for known in _truths().values() for f in known["files"])
         raise DataError(one_of(name, files if "/" in name else datasets(), "shipped data"))
     return path

@@ -333,8 +333,7 @@ def _check_time(t: Array, run: str) -> None:
         raise DataError(f"{run}: a run needs at least {MIN_SAMPLES} samples; this one has {len(t)}.")
     if not np.isfinite(t).all():
         raise DataError(f"{run}: the time of sample {int(np.argmin(np.isfinite(t)))} is not a finite number.")
-    back = np.flatnonzero(np.diff(t) <= 0)
-    if back.size:
+    if (back := np.flatnonzero(np.diff(t) <= 0)).size:
         j = int(back[0])
         raise DataError(f"{run}: time must increase strictly, but sample {j + 1} (t = {t[j + 1]:.9g} s) does "
                         f"not come after sample {j} (t = {t[j]:.9g} s); {back.size} such steps. "

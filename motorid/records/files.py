@@ -56,8 +56,7 @@ def check_output(path: str | Path, force: bool = False) -> Path:
     try:
         if "\0" in str(target):
             raise ValueError("no name of a file holds a zero byte")
-        target = target.resolve() if target.is_symlink() else target
-        if target.is_dir() or not target.parent.is_dir():
+        if (target := target.resolve() if target.is_symlink() else target).is_dir() or not target.parent.is_dir():
             raise UsageError(f"cannot write {path}: " + ("it is a folder." if target.is_dir() else
                              f"there is no folder {target.parent}."))
         if (target.is_file() or not target.exists()) and not os.access(target.parent, os.W_OK):

@@ -241,8 +241,7 @@ def _by_words(words: list[str], unit: Unit | None, explicit: bool) -> HeaderMatc
 
 def _channel_of(words: list[str]) -> tuple[str | None, float]:
     """Channel and score of the words without the unit; a score below one needs a unit to confirm it."""
-    whole = "".join(words)
-    if whole in _CHANNEL:
+    if (whole := "".join(words)) in _CHANNEL:
         return _CHANNEL[whole], 4.0
     hits = [stem for w in words if (stem := w.rstrip("0123456789")) in _CHANNEL]
     hits = [s for s in hits if len(s) > 2] or hits

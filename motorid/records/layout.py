@@ -104,8 +104,7 @@ def _named_by_user(labels: Sequence[str], columns: Mapping[str, object], units: 
         if column is None:
             continue
         label = _find(labels, column)
-        unit = row[label] or headers.unit_in(label)[1]
-        if unit and unit.dimension not in DIMENSIONS[channel]:
+        if (unit := row[label] or headers.unit_in(label)[1]) and unit.dimension not in DIMENSIONS[channel]:
             named = headers.classify(label, row[label])  # u_a is in no ampere, current_A is
             sure = (named and named.unit) or headers.unit_in(label)[2]
             unit = None if {channel, label} & set(units) or not sure else headers.require_unit(

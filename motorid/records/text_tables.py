@@ -63,8 +63,7 @@ def parse_table(data: bytes) -> TextTable:
             for row in body]  # what ends a statement, and no cell
     if not (body := body and _unnamed(body, notes)):
         raise DataError("it holds no rows" + (", only comments." if comments else "; the file is empty."))
-    cells = len(re.findall(r"[\t;, ]+", body[len(body) // 2]))
-    if cells > MOST_COLUMNS:
+    if (cells := len(re.findall(r"[\t;, ]+", body[len(body) // 2]))) > MOST_COLUMNS:
         raise DataError(f"a row has about {cells} cells; at most {MOST_COLUMNS} columns are read. Is there one row per "
                         "sample?")
     if _JSON.match(text) and (_is_json(text) or all(map(_is_json, body[:2]))):
@@ -116,8 +115,7 @@ def decode(data: bytes) -> tuple[str, list[str]]:
         text = data.decode(encoding)
     except UnicodeDecodeError:
         text = data.decode("latin-1")
-    control = len(_CONTROL.findall(text.rstrip("\0")))
-    if control > 0.003 * len(text):
+    if (control := len(_CONTROL.findall(text.rstrip("\0")))) > 0.003 * len(text):
         raise DataError("it is a binary file, not a text table; export it as CSV.")
     if not control and not text.endswith("\0"):
         return text, []
@@ -248,8 +246,7 @@ def _parse(rows: list[str], dialect: Dialect, labels: list[str],
         cells, words = column, column.dtype.kind not in "fiub"
         if words:
             cells = column.astype(str).str.strip(" \"'")
-            grouped = cells.str.fullmatch(_GROUPED[dialect.decimal])
-            if grouped.any():
+            if (grouped := cells.str.fullmatch(_GROUPED[dialect.decimal])).any():
                 first = cells[grouped].iloc[0]
                 notes.append(f"'{label}' has '{re.findall(group, first)[0]}' between thousands, as in '{first}'.")
                 cells = cells.where(~grouped, cells.str.replace(group, "", regex=True))

@@ -209,8 +209,7 @@ def motors_in(folder: str | Path) -> dict[str, list[Path]]:
     >>> list(mi.motors_in(mi.data_path("hidden_friction")))
     ['check1', 'run1', 'run2']
     """
-    place = Path(folder)
-    if not place.is_dir():
+    if not (place := Path(folder)).is_dir():
         raise DataError(f"'{place}' is not a folder; fit-many takes one with a folder, or a file, per motor.")
     found: dict[str, list[Path]] = {}
     for entry in sorted(place.iterdir()):

@@ -71,8 +71,7 @@ class Solved:
     @property
     def verdict(self) -> tuple[str, str]:
         """``"converged"``, ``"stalled"``, ``"limit"`` or ``"failed"``; why it ended, and what to try."""
-        status = self.result.status
-        if status in GOOD:
+        if (status := self.result.status) in GOOD:
             return "converged", "converged: the optimality conditions hold"
         if status in SAID:
             return SAID[status]
@@ -221,8 +220,7 @@ def contradiction(problem: Problem, q: Array) -> str | None:
     At the least sum of squared violations those that are left push against one another, or against the limits of
     the parameters; the others have no part in it."""
     found = [_least_violations(problem, start) for start in (q, problem.start)]
-    at = min((f for f in found if f is not None), key=lambda f: f[0], default=None)
-    if at is None or at[0] < MISSED:
+    if (at := min((f for f in found if f is not None), key=lambda f: f[0], default=None)) is None or at[0] < MISSED:
         return None
     left = [c for c in problem.constraints if np.abs(_violation_rows(problem, [c], at[1], False)[0]).max() >= MISSED]
     beyond = "; ".join(f"{n}: {v:.3g}" for n, v in violations(problem, at[1], left).items() if v)
