@@ -55,7 +55,7 @@ CHANGES = {"t": "changes with the time", "distance": "changes with the distance 
            "turn": "changes with the angle within a turn", "theta": "changes with the angle",
            "omega": "changes with the speed", "i": "changes with the current", "v": "changes with the voltage",
            "load": "changes with the power drawn", "twist": "changes with its twist", "slip": "changes with its slip",
-           "load speed": "changes with the speed of that", "run": "differs from run to run",
+           "load speed": "changes with the speed of the load", "run": "differs from run to run",
            "past i": "depends on the current before", "past omega": "depends on the speed before",
            "past v": "depends on the voltage before", "path": "depends on the distance since a reversal",
            "past speed": "depends on how fast it ran before", "past power": "depends on how fast it ran before",
@@ -125,7 +125,7 @@ _PUSHES = (  # words, balance, carrier, quantities
     ("a motor constant", "both", "", ("t", "turn", "theta", "omega", "i", "run", "past i", "past size", "most i")))
 FORMS = (*(Form(words, balance, on, carrier) for words, balance, carrier, quantities in _PUSHES for on in quantities),
          *(Form("a torque of the coupling to the load", "coupling", on) for on in COUPLED[:2]),
-         Form("a torque on the load behind its coupling", "load", "load speed"),
+         Form("a torque behind the coupling", "load", "load speed"),
          *(Form("a gain of the speed sensor", "sensor", on, "omega", "omega") for on in ("turn", "t", "i")),
          *(Form("a gain of the current sensor", "sensor", on, "i", "i") for on in ("t", "past heat")),
          *(Form("an error of the angle sensor", "sensor", on, "", "theta")

@@ -284,6 +284,9 @@ class Curve:
                  f"{percent(miss, 2)} of it)." for text, miss in self.nearest()[:1]]
         if "encoder_zero" in self.fit.model.effect_names:
             known.append("    To add with mi.effects.encoder_zero: the angle has another zero in every run.")
+        if (load := self.parts[0].span.load) and self.parts[0].form.on in COUPLED:
+            name = next(e.name for e in self.fit.model.effects if LOADS[load] in {p.name for p in e.parameters})
+            known.append(f"    To add with mi.effects.{name}, whose load it acts on.")
         if "T_a" in self.fit.values:
             known.append(f"    To add with mi.effects.speed_average, T_a = {self.fit.values['T_a']:.6g} s.")
         return "\n".join(["import casadi as ca", "", "import motorid as mi", "", "",

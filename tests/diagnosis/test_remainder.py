@@ -1254,6 +1254,7 @@ def test_what_rubs_behind_a_shaft_and_a_shaft_that_stiffens_are_curves_of_the_lo
     assert (first.balance, first.on) == (balance, on)
     errors = mi.evaluate(left.fitted, runs[2:]).nrmse
     assert all(errors[c] < (1.1 if closed else 3) * floor[c] < mi.evaluate(fit, runs[2:]).nrmse[c] for c in floor)
+    assert "To add with mi.effects.compliance, whose load it acts on." in left.code()
     assert closed is None or left.nearest()[0][0].startswith(closed)
 
 
