@@ -51,7 +51,7 @@ FACES = {".", "effects", "integrate", "acquire", "plots", "cli"}  # their __init
 MOODS = {"held", "revival", "revived", "hardly", "endings", "ending", "beginning", "narrowing", "remedies", "surely",
          "judgement", "astray", "adrift", "favourite"}
 LONGEST_FUNCTION = 45  # lines of code without the docstring
-MOST_FILES, MOST_LINES, MOST_LAYERS = 130, 27_569, 11
+MOST_FILES, MOST_LINES, MOST_LAYERS = 130, 27_570, 11
 
 
 class Import(NamedTuple):

@@ -122,8 +122,7 @@ class _Unwrapper:
         if math.isnan(raw):
             return raw
         first = math.isnan(self.value)  # then it is the turn that is nearest to zero
-        expected = 0.0 if first else self.value + self.rate * self.since
-        value = raw + self.span * round((expected - raw) / self.span)
+        value = raw + self.span * round(((0.0 if first else self.value + self.rate * self.since) - raw) / self.span)
         self.rate = 0.0 if first else (value - self.value) / self.since
         self.value, self.since = value, 0
         return value

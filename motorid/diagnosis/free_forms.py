@@ -5,7 +5,7 @@ kinks at zero for what has a sign; for what remembers, first-order lags of many 
 fading memory (Laguerre and Kautz models: Wahlberg, IEEE Trans. Automatic Control 36(5), 1991)."""
 
 import re
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from types import SimpleNamespace
@@ -20,6 +20,7 @@ from motorid.errors import SimulationError
 from motorid.estimation.angle_orders import likely_lines, uses_angle
 from motorid.estimation.linearisation import Response, Tangent, parameter_vector, responses
 from motorid.estimation.result import Fit
+from motorid.model.equations import System
 from motorid.numerics.signals import Array, despiked
 from motorid.problem.problem import Problem
 from motorid.problem.runs import angle_signal, time_since
@@ -175,12 +176,12 @@ def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
     free, moving = set(fit.problem.model.free_names), len({"omega", "theta"} & {*fit.problem.outputs})
     unscaled = tuple(c for c, own in (("i", "RLbJ"), ("omega", "KbJ")) if free >= {*own} and (c == "i" or moving == 1))
     return Span(ranges, tuple(sorted(orders)), step, rates={n: w[:LINES] for n, w in rates.items()}, unscaled=unscaled,
-                load=load_of(fit.problem.system.states))
+                load=load_of(fit.problem.system))
 
 
-def load_of(states: Container[str]) -> str:
+def load_of(system: System) -> str:
     """Return which of `LOADS` a model has, none as an empty string."""
-    return next((name for name in LOADS if f"omega_{name}" in states), "")
+    return next((n for n, share in LOADS.items() if f"omega_{n}" in system.states and share in system.parameters), "")
 
 
 def _rates(fit: Fit, along: Sequence[Array], step: float) -> list[float]:
@@ -498,11 +499,10 @@ def linearised(fit: Fit, only: Form | None = None, span: Span | None = None,
 
 def _with_load(fit: Fit, k: int, answer: Response) -> Array:
     """Return what a voltage, a torque and one on the load push each state over a sample, (N-1, nx, 2 or 3)."""
-    states = fit.problem.system.states
-    if not (load := load_of(states)):
+    if not (load := load_of(system := fit.problem.system)):
         return answer.b
     inertia = fit.values["J"] * max(fit.values[LOADS[load]], SHARP)
-    own = (np.eye(len(states)) + answer.a)[:, :, states.index(f"omega_{load}")]
+    own = (np.eye(len(system.states)) + answer.a)[:, :, system.states.index(f"omega_{load}")]
     own *= (0.5 * np.diff(fit.problem.experiments[k].t) / inertia)[:, None]
     return np.concatenate([answer.b, own[:, :, None]], axis=2)
 
@@ -535,7 +535,7 @@ def _signals(fit: Fit, k: int) -> dict[str, Array]:
         found["acceleration"] = fit.values["J"] * np.gradient(omega, run.t)  # of a relative inertia
         found["energy"] = 0.5 * fit.values["J"] * omega**2
         gone = np.cumsum(0.5 * np.abs(omega[1:] + omega[:-1]) * np.diff(run.t))  # both directions counted
-        if load := load_of(sim.states):
+        if load := load_of(fit.problem.system):
             found["load speed"] = np.asarray(sim.states[f"omega_{load}"])
             found["slip"] = omega - found["load speed"]
             if f"twist_{load}" in sim.states:

@@ -72,9 +72,8 @@ def locate(fit: Fit) -> Missing:
 def acting_like(missing: Missing, form: Form) -> Missing:
     """Return `missing` with what is known of its form: which balance it acts in, and what it changes with."""
     apart = missing.where is not None or form.balance == "sensor"
-    fails = {"both": "Both balances fail.", "sensor": "The measurement fails.", **dict.fromkeys(
-        ("coupling", "load"), "The torque balance fails.")}
-    lead = fails.get(form.balance, f"The {form.balance} balance fails.") if apart else missing.text.split(".")[0] + "."
+    fails = {"both": "Both balances fail.", "sensor": "The measurement fails.", "voltage": "The voltage balance fails."}
+    lead = fails.get(form.balance, "The torque balance fails.") if apart else missing.text.split(".")[0] + "."
     text = f"{lead} What is missing acts like {form.text}. {_region(missing.regions)}"
     return replace(missing, where=WHERE[form.balance] if apart else None, acts_like=form.text, text=text)
 

@@ -303,14 +303,12 @@ def sample_of(fit: Fit) -> float:
 def _half_a_sample(fit: Fit, effect: Effect) -> bool:
     """Tell whether an effect makes the speed late by half a sample of the records, or the mean over each predicts as
     well in its place, whatever lag the winding, the rotor and the noise of counts then share out among them."""
-    if effect.name not in LATENESS:
+    if effect.name not in LATENESS or "speed_average" in fit.model.without(effect.name).effect_names:
         return False
     half, name, share = 0.5 * sample_of(fit), effect.parameters[0].name, LATENESS[effect.name]
     late, unsure = share * fit.values[name], STANDARD_ERRORS * share * (fit.std.get(name) or 0.0)
     if abs(late - half) < max(TRIFLE * half, min(unsure, half)):
         return True
-    if "speed_average" in fit.model.without(effect.name).effect_names:
-        return False
     model = (fit.model.without(effect.name) + LIBRARY["speed_average"]).fix(T_a=2 * half)
     other = otherwise(None, FAILURES, lambda: solve(fit.problem.with_(model=model), QUICK))
     both = [f and predictive_score.predictions_left_out(f) for f in (other, fit)]

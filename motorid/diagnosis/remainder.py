@@ -71,6 +71,7 @@ OTHER_PLACES = {"1": "where it sets in, a share of the largest", "V": "half of i
                 "1:wave": "how many to the turn", "rad:phase": "its phase", "rad:wide": "half of its width",
                 "rad:edge": "how wide its edges are", "1:damped": "how much its swing is damped",
                 "rad:slip": "how far it slips until what it drags along follows"}
+STRAIGHT = ("omega", "i", "v", *COUPLED)
 COUPLINGS = {"compliance", "backlash", "slip_clutch", "freewheel"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad", "rad²/s²": "·s²/rad²", "A²": "/A²"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
@@ -156,8 +157,7 @@ class Part:
         """The same as source. Few functions are a law, which goes on, in a balance straight as R·i; of many nothing is
         known beyond."""
         terms = [PLACE.sub(r"\1", f) for f in self.placed(places)]
-        on_a_size = self.moved and self.form.on in ("omega", "i", "v", *COUPLED)
-        straight = [CLIPPED.sub("z", f) if on_a_size else f for f in terms]
+        straight = [CLIPPED.sub("z", f) if self.moved and self.form.on in STRAIGHT else f for f in terms]
         each = zip(terms, straight, strict=True)
         return [on if self.form.balance == "sensor" or "*" not in on else f for f, on in each]
 
@@ -174,7 +174,7 @@ class Part:
     @property
     def place(self) -> tuple[str, str]:
         """Unit of the places, and what they are."""
-        if (on := self.form.on) in ("omega", "i", "v", "load", *COUPLED):
+        if (on := self.form.on) in ("load", *STRAIGHT):
             return "", f"where it bends, a share of {number(max(map(abs, self.span.ranges[on])), 4)} {SI[on]}"
         unit = "rad" if on in ("theta", "turn", "distance", "path") else "s"
         return unit, "how long it remembers" if on in PAST else "where it lies, bends, sets in or fades"
@@ -284,7 +284,7 @@ class Curve:
                  f"{percent(miss, 2)} of it)." for text, miss in self.nearest()[:1]]
         if "encoder_zero" in self.fit.model.effect_names:
             known.append("    To add with mi.effects.encoder_zero: the angle has another zero in every run.")
-        if (load := self.parts[0].span.load) and self.parts[0].form.on in COUPLED:
+        if load := next((part.span.load for part in self.parts if part.form.on in COUPLED), ""):
             name = next(e.name for e in self.fit.model.effects if LOADS[load] in {p.name for p in e.parameters})
             known.append(f"    To add with mi.effects.{name}, whose load it acts on.")
         if "T_a" in self.fit.values:
@@ -527,10 +527,12 @@ class Remainder:
         load behind it; a shaft with play is one that stiffens, too."""
         coupled = {e.name for e in self.fit.model.effects} & COUPLINGS
         base = coupled and (_without(self.fit, self._approximating.keys() - coupled) or self.fit)
-        if base and "backlash" in coupled:
-            bare = reduce(Model.without, coupled, base.model)
-            start = {"r_load": base.values["r_gap"], "omega_r": base.values["omega_c"], "zeta_r": base.values["zeta_c"]}
-            base = _once(lambda: refit(base, bare + LIBRARY["compliance"], [base.values | start]), base, "shaft")
+        with contextlib.suppress(ModelError):
+            if base and "backlash" in coupled:
+                shaft = reduce(Model.without, coupled, base.model) + LIBRARY["compliance"]
+                alike = {"r_load": "r_gap", "omega_r": "omega_c", "zeta_r": "zeta_c"}
+                start = base.values | {new: base.values[old] for new, old in alike.items()}
+                base = _once(partial(refit, base, shaft, [start]), base, "shaft")
         if base:
             yield from ((curve, form) for curve, form in _beyond(base) if form.on in COUPLED)
 
@@ -804,7 +806,7 @@ def _name(fit: Fit) -> str:
 def _growing(curve: Curve, form: Form, moved: bool, before: Predictions, held: HeldOut) -> Iterator[Grown]:
     """Yield a curve with a form more, of ever more functions, as long as these help."""
     best, led = float("-inf"), None
-    if form.on in COUPLED and not load_of(curve.fit.problem.system.states):
+    if form.on in COUPLED and not load_of(curve.fit.problem.system):
         return
     with contextlib.suppress(*FAILURES):
         for begun in dict.fromkeys((curve.begun.first or curve.begun, curve.begun)) if moved and curve.begun else ():

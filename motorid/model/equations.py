@@ -22,8 +22,8 @@ class Equations:
     """Balances, quantities, states and sensors of one model while it is being written.
 
     An effect reads ``m.i, m.omega, m.theta, m.v, m.R, m.K, …`` and writes ``m.voltage``, ``m.torque``, `scale`,
-    `replace`, `state`/`rate` and `measure`. A quantity that is read is a placeholder, filled when the model closes, so
-    the order of effects does not matter. `states` are those of the base, among ``i, omega``; with `angle_input` the
+    `replace`, `state`/`rate`, `push` and `measure`. A quantity that is read is a placeholder, filled when the model
+    closes, so the order does not matter. `states` are those of the base, among ``i, omega``; with `angle_input` the
     angle seen by the effects is a given signal instead of the model's own state."""
 
     def __init__(self, states: tuple[str, ...], angle_input: bool = False) -> None:
