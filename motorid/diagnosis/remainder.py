@@ -526,12 +526,12 @@ class Remainder:
         """Yield the model with a shaft or a clutch, whatever else only approximates left out, with what is known of the
         load behind it; a shaft with play is one that stiffens, too."""
         coupled = {e.name for e in self.fit.model.effects} & COUPLINGS
-        base = coupled and (_without(self.fit, self._approximating.keys() - coupled) or self.fit)
+        base = (_without(self.fit, self._approximating.keys() - coupled) or self.fit) if coupled else None
         with contextlib.suppress(ModelError):
             if base and "backlash" in coupled:
                 shaft = reduce(Model.without, coupled, base.model) + LIBRARY["compliance"]
                 alike = {"r_load": "r_gap", "omega_r": "omega_c", "zeta_r": "zeta_c"}
-                start = base.values | {new: base.values[old] for new, old in alike.items()}
+                start = {**base.values, **{new: base.values[old] for new, old in alike.items()}}
                 base = _once(partial(refit, base, shaft, [start]), base, "shaft")
         if base:
             yield from ((curve, form) for curve, form in _beyond(base) if form.on in COUPLED)
@@ -853,8 +853,8 @@ def _closed_forms(on: str, z: Array) -> list[tuple[str, Sequence[Array]]]:
         return [(f"one wave, {k} to the turn", [np.sin(k * z), np.cos(k * z)]) for k in range(1, 13)]
     if on in ("theta", "t", "distance"):
         found = [("a constant", [one]), ("a straight line", [one, z]), ("its square", [z**2]), ("its cube", [z**3])]
-        return found + [(f"a constant and what fades within {number(c, 2)} {'s' if on == 't' else 'rad'}",
-                         [one, np.exp(-z / c)]) for c in np.geomspace(0.01, 2, CLOSED) * top if on != "theta"]
+        return [*found, *((f"a constant and what fades within {number(c, 2)} {'s' if on == 't' else 'rad'}",
+                           [one, np.exp(-z / c)]) for c in np.geomspace(0.01, 2, CLOSED) * top if on != "theta")]
     found = [("a constant", [one]), ("proportional to it", [z]), ("proportional to its size", [np.abs(z)]),
              ("its sign alone", [side]), ("its square, with its sign", [z * np.abs(z)]),
              ("its sign and proportional to it", [side, z])]
