@@ -32,6 +32,7 @@ NUMBERS = {  # one plausible size of every effect
     "speed_filter": {"T_f": 5e-3, "zeta_f": 0.4},
     "angle_lag": {"T_pos": 6e-3},
     "current_lag": {"T_i": 2e-3},
+    "current_average": {"T_m": 6e-3},
     "speed_delay": {"T_d": 8e-3},
     "current_offset": {"i_0": 0.03},
     "speed_gain": {"k_w": 0.05},

@@ -328,6 +328,12 @@ def current_lag(m: Motor, T_i: float) -> Hooks:
 
 
 @_known
+def current_average(m: Motor, T_m: float) -> Hooks:
+    """The charge of the last T_m seconds, over T_m."""
+    return {"sensor": ("current_average", T_m)}
+
+
+@_known
 def angle_lag(m: Motor, T_pos: float) -> Hooks:
     return {"sensor": ("angle_lag", T_pos), "rate": 1 / T_pos}
 

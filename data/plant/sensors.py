@@ -81,14 +81,17 @@ class Chain:
         self.filter, self._rate = has.get("speed_filter"), 0.0
         self.delay, self.gain = has.get("speed_delay", 0.0), has.get("speed_gain", 1.0)
         self.offset, self.window = has.get("current_offset", 0.0), has.get("speed_average", 0.0)
+        self.window_i = has.get("current_average", 0.0)
         self.speed_offset, self.current_gain = has.get("speed_offset", 0.0), has.get("current_gain", 1.0)
         self.ripple = has.get("speed_ripple", (0.0, 1.0, 0.0, 0.0))
         self.duty = has.get("duty", lambda v: 1.0)
         self.i, self.w = 0.0, float(omega0)
         self._last = (0.0, float(omega0))
-        self._at_once = not (self.lag_i or self.lag_w or self.lag_th or self.filter or self.delay or self.window)
+        self._keeps = bool(self.delay or self.window or self.window_i)
+        self._at_once = not (self.lag_i or self.lag_w or self.lag_th or self.filter or self._keeps)
         self._turned, self._omega0 = 0.0, float(omega0)  # the integral of the speed
-        self._times, self._speeds = [0.0], [0.0 if self.window else float(omega0)]
+        self._charge = 0.0
+        self._times, self._speeds, self._charges = [0.0], [0.0 if self.window else float(omega0)], [0.0]
 
     def sample(self, t: float, h: float, i: float, w: float) -> None:
         """Follow the true current and speed, taken as straight lines over the last step of h seconds."""
@@ -103,32 +106,36 @@ class Chain:
             self.w = _lag(self.w, self._last[1], w, h, self.lag_w)
         if self.window:  # what is kept and looked up is the angle
             self._turned += 0.5 * h * (self._last[1] + w)
+        if self.window_i:
+            self._charge += 0.5 * h * (self._last[0] + i)
         self._last = (i, w)
-        if self.delay or self.window:
+        if self._keeps:
             self._times.append(t)
             self._speeds.append(self._turned if self.window else self.w)
-            if len(self._times) > 4096 and self._times[2048] < t - self.delay - self.window:
-                del self._times[:2048], self._speeds[:2048]
+            self._charges.append(self._charge)
+            if len(self._times) > 4096 and self._times[2048] < t - self.delay - self.window - self.window_i:
+                del self._times[:2048], self._speeds[:2048], self._charges[:2048]
 
     def read(self, t: float, y: list[float], v: float) -> dict[str, float]:
         """Return what is seen at the time t of the state y, with v volts commanded."""
-        w = self._delayed(t - self.delay) if self.delay else self.w
+        w = self._before(self._speeds, t - self.delay) if self.delay else self.w
         if self.window:
-            w = (self._turned - self._delayed(t - self.window)) / self.window
-        i = self.current_gain * self.duty(v) * self.i + self.offset
+            begun = self._omega0 * min(t - self.window, 0.0)
+            w = (self._turned - begun - self._before(self._speeds, t - self.window)) / self.window
+        i = (self._charge - self._before(self._charges, t - self.window_i)) / self.window_i if self.window_i else self.i
+        i = self.current_gain * self.duty(v) * i + self.offset
         part, periods, phase, angle = self.ripple
         w *= 1 + part * sin(periods * y[2] + phase)
         theta = y[2] - angle * part / periods * cos(periods * y[2] + phase) - (self.lag_th or 0.0) * self._behind
         return {"i": i, "omega": self.gain * w + self.speed_offset, "theta": theta}
 
-    def _delayed(self, t: float) -> float:
+    def _before(self, kept: list[float], t: float) -> float:
+        """Return what was kept of the time t, or of the start before it."""
         k = bisect_right(self._times, t + 1e-12)
-        if k == 0:
-            return self._omega0 * t if self.window else self._speeds[0]
-        if k == len(self._times):
-            return self._speeds[-1]
+        if k in (0, len(self._times)):
+            return kept[-min(k, 1)]
         part = max(0.0, (t - self._times[k - 1]) / (self._times[k] - self._times[k - 1]))
-        return self._speeds[k - 1] + part * (self._speeds[k] - self._speeds[k - 1])
+        return kept[k - 1] + part * (kept[k] - kept[k - 1])
 
 
 def _lag(z: float, u0: float, u1: float, h: float, tau: float | None) -> float:

@@ -145,6 +145,7 @@ SINGLES = [
     single("speed_lag", "wheel", {"T_w": 0.012}, train=("prbs", "stairs")),
     single("speed_filter", "lab", {"T_f": 4e-3, "zeta_f": 0.3}, train=("prbs", "stairs")),
     single("current_lag", "lab", {"T_i": 3e-3}, train=("prbs", "stairs")),
+    single("current_average", "lab", {"T_m": 0.02}, train=("prbs", "stairs")),
     single("angle_lag", "lab", {"T_pos": 0.012}, train=("prbs", "stairs"), channels=("i", "theta")),
     single("speed_delay", "lab", {"T_d": 6e-3}, train=("prbs", "chirp")),
     single("current_offset", "micro", {"i_0": 0.02}, train=("stairs", "multisine")),

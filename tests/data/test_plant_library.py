@@ -17,7 +17,8 @@ from motorid.model.model import dc_motor
 INEXACT = {"coulomb": 5e-4, "coulomb_asymmetric": 5e-4, "stribeck": 5e-4, "load_friction": 2e-4,
            "viscous_asymmetric": 1e-5, "current_lag": 2e-5, "speed_delay": 0.01, "backlash": 0.04,
            "angular_friction": 5e-4, "gear_efficiency": 2e-4, "driver_coast": 2e-3, "driver_current_limit": 1e-2,
-           "driver_one_quadrant": 3e-3, "speed_average": 2e-3, "slip_clutch": 1e-2, "driver_slew": 1e-5}
+           "driver_one_quadrant": 3e-3, "speed_average": 2e-3, "current_average": 5e-3,
+           "slip_clutch": 1e-2, "driver_slew": 1e-5}
 
 
 def by_library(model, t, v, channels=("i", "omega")):

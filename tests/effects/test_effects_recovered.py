@@ -36,6 +36,7 @@ TRUTH = {
     "speed_filter": {"T_f": 5e-3, "zeta_f": 0.4},
     "angle_lag": {"T_pos": 4e-3},
     "current_lag": {"T_i": 8e-4},
+    "current_average": {"T_m": 6e-3},
     "speed_delay": {"T_d": 5e-3},
     "current_offset": {"i_0": 0.05},
     "speed_gain": {"k_w": 0.04},
