@@ -82,6 +82,11 @@ def whole_of(fit: Fit, records: Sequence[Experiment]) -> list[Experiment]:
     return runs if any("part of" in r.meta for r in parts) and _samples(runs) <= WHOLE * _samples(parts) else []
 
 
+def thinned(fit: Fit, records: Sequence[Experiment]) -> bool:
+    """Tell whether a fit is of every few samples of `records`."""
+    return 1 < _samples(records) / _samples(fit.problem.experiments) <= WHOLE and not whole_of(fit, records)
+
+
 def fitted_to(fit: Fit, runs: Sequence[Experiment] | None, effort: LevenbergMarquardt | None = None) -> Fit:
     """Return the fit of the same model to other runs, from where it is; `fit` itself for none, or where that fails."""
     try:

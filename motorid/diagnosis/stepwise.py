@@ -294,9 +294,10 @@ def explored(fit: Fit, validate: Sequence[Experiment] | Experiment | None, effec
     def left() -> float | None:
         return None if seconds is None else max(seconds - (time.monotonic() - began), 0.0)
 
-    def climbed(records: Records, most: int = max_effects, early: bool = False) -> Climb:
+    def climbed(records: Records, most: int = max_effects, early: bool = False, among: Collection[str] = ()) -> Climb:
         stages.climb()
-        return climb(Search(records.fit, records.held_out, effects, stages), most, left(), early)
+        tried = [e for e in effects if not among or e.name in among]
+        return climb(Search(records.fit, records.held_out, tried, stages), most, left(), early)
 
     looks = _looks(fit, [validate] if isinstance(validate, Experiment) else validate, climbed, left)
     found, records = next(looks)
@@ -322,8 +323,9 @@ def _looks(fit: Fit, held_out: Sequence[Experiment] | None, climbed: Callable[..
     seconds = left()
     as_it_was, records, found = _read_and_climbed(versions.affordable(fit), held_out, climbed)
     yield found, records
-    if (seconds is None or (left() or 0.0) > 2 * seconds / 3) and look(_remembers, found, fit, held_out):
-        *whole, anew = _read_and_climbed(fit, held_out, climbed)
+    time = seconds is None or (left() or 0.0) > 2 * seconds / 3
+    if among := time and look(_asking_for_all, found, fit, held_out):
+        *whole, anew = _read_and_climbed(fit, held_out, partial(climbed, among=among))
         found = replace(found, stopped=anew.stopped) if anew.stopped else anew
         as_it_was, records = whole if found is anew else (as_it_was, records)
         yield found, records
@@ -385,21 +387,25 @@ def _read_and_climbed(fit: Fit, held_out: Sequence[Experiment] | None,
     return as_it_was, records, found
 
 
-def _remembers(found: Climb, whole: Fit, held_out: Sequence[Experiment] | None) -> bool:
-    """Tell whether a model with a memory, which begins anew in every part of a record, leaves noise on whole ones: one
-    on the way, or the most promising that was refused where all that was found leaves more. Not where these would take
-    more than `WHOLE` times as long."""
-    if not (runs := versions.whole_of(found.search.root.fit, whole.problem.experiments)):
-        return False
-    refused = (c for tried in found.rounds[-1:] for c in tried if c.fit is not None and c.fit.memories)
+def _asking_for_all(found: Climb, whole: Fit, held_out: Sequence[Experiment] | None) -> set[str]:
+    """Return the effects to try on all records, where a model leaves noise of these and more of what was looked at:
+    all where one with a memory does, on the way or the most promising that was refused, as it begins anew in every part
+    of a record; those refitted where the last does, as a held voltage steps between the samples of thinned records. Not
+    where all would take more than `WHOLE` times as long."""
+    last, every, rounds = found.path[-1].fit, whole.problem.experiments, found.rounds
+    refused = (c for tried in rounds[-1:] for c in tried if c.fit is not None and c.fit.memories)
     best, enough = max(refused, key=lambda c: c.gain or 0.0, default=None), found.remaining.adequate
     fits = [node.fit for node in found.path[1:]]
-    for fit in fits[:-1] if enough else [*fits, best and best.fit]:
+    fits = [f for f in (fits[:-1] if enough else [*fits, best and best.fit]) if f and f.memories]
+    runs = versions.whole_of(found.search.root.fit, every)
+    looks = [(f, runs, {e.name for e in found.search.effects}) for f in fits if runs]
+    if far(last) and versions.thinned(last, every):
+        looks.append((last, every, {n for tried in rounds for c in tried if c.fit for n in c.effect.split(" + ")}))
+    for fit, records, effects in looks:
         with contextlib.suppress(*FAILURES):
-            again = versions.fitted_to(fit, runs, QUICK) if fit and fit.memories else None
-            if again is not None and at_noise(node_of(again, HeldOut.of(whole, held_out))):
-                return True
-    return False
+            if at_noise(node_of(versions.fitted_to(fit, records, QUICK), HeldOut.of(whole, held_out))):
+                return effects
+    return set()
 
 
 def _seen_on_whole(found: Climb, whole: Fit) -> Climb:

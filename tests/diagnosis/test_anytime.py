@@ -130,7 +130,8 @@ def test_what_was_found_is_kept_where_the_look_at_what_remains_is_interrupted(pl
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OutOfTime])
-@pytest.mark.parametrize("look", ["_remembers", "_in_windows", "_late_reading", "_seen_on_whole", "_beside_curves"])
+@pytest.mark.parametrize("look", ["_asking_for_all", "_in_windows", "_late_reading", "_seen_on_whole",
+                                  "_beside_curves"])
 def test_what_was_found_is_kept_where_a_look_after_the_search_is_interrupted(plain, monkeypatch, look, error):
     asked = []
 
