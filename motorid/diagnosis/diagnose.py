@@ -180,11 +180,13 @@ def _left(found: Climb, named: bool, graded: bool, records: Sequence[Experiment]
     more = "fluctuation" if named or (remaining.adequate and not graded) else "structure"  # which an imitation hides
     kind = "structure" if not remaining.adequate else more if far(last) else "noise"
     approximating = {g.effect: g.form for g in found.grades if g.grade == "approximates"}
+    if remaining.hum:  # no missing physics, and a curve all the same
+        kind, forms = "structure", in_turn(better_forms(last, last))
     if kind == "noise" and graded and not named and far(root := found.search.root.fit):
         kind, last, approximating = "structure", root, {}  # beside what imitates it down to the noise nothing shows
         forms = in_turn(better_forms(last, last))
     left = Remainder(kind, last, forms, found.search.held, found.search.root.fit, approximating, records)
-    if not (named or found.stopped) and left.proposed and seconds:
+    if not (named or found.stopped or remaining.hum) and left.proposed and seconds:
         found.search.stages.at("Growing a curve of what is left")
         try:
             with parallel.budget(seconds):

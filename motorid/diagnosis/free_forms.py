@@ -5,7 +5,7 @@ kinks at zero for what has a sign; for what remembers, first-order lags of many 
 fading memory (Laguerre and Kautz models: Wahlberg, IEEE Trans. Automatic Control 36(5), 1991)."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from types import SimpleNamespace
@@ -68,6 +68,8 @@ CHANGES = {"t": "changes with the time", "distance": "changes with the distance 
            "since_reversal": "depends on the time since the voltage was reversed"}
 PAST = (*(on for on in CHANGES if on.startswith("past ")), "path")
 MEMORIES = 8  # lengths of memory
+OVERTONES = 5  # of what swings, or is switched, at a rate of its own
+SWINGS = 4  # at least in a record: what is slower is a drift
 TRIPS = (0.02, 0.05, 0.1, 0.2, 0.4)  # of the largest heat: where a fuse or a derating sets in
 PLAY = (0.01, 0.4)  # of the largest value: half of the least and of the largest play
 DAMPED = 0.1  # share of the critical damping with which what swings begins
@@ -78,7 +80,7 @@ LASTING = 10.0  # times the longest run: a memory that forgets nothing in it
 class Form:
     """A free function of the quantity `on` times `carrier`, in one balance; `words` says what that is. In the balance
     ``"sensor"`` it is added to the output `channel`; ``"both"`` is the motor constant, which makes torque of current
-    and voltage of speed. A `zeroed` one is over an angle whose zero is another in every run."""
+    and voltage of speed. A `zeroed` one is over an angle, or swings over a time, whose zero is another in every run."""
 
     words: str
     balance: str
@@ -90,7 +92,14 @@ class Form:
     @property
     def text(self) -> str:
         """What it is, in words."""
-        return f"{self.words} that {CHANGES[self.on]}{', its zero another in every run' * self.zeroed}"
+        zero = " in waves whose phase is another in every run" if self.on == "t" else ", its zero another in every run"
+        return f"{self.words} that {CHANGES[self.on]}{zero * self.zeroed}"
+
+    @property
+    def swings(self) -> str:
+        """Which of a span's rates its waves over the time have, whose phase is another in every run; empty for none."""
+        shares = self.balance == "both" or self.carrier in ("v", "i", "omega")
+        return ("beat" if shares else "swing") if self.zeroed and self.on == "t" else ""
 
     @property
     def local(self) -> bool:
@@ -167,7 +176,8 @@ def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
     lines = likely_lines(Tangent.of(fit), LIBRARY["cogging"], LINES) if "theta" in fit.problem.outputs else []
     orders = {*range(1, HARMONICS + 1), *(round(k * n) for n in known for k in range(1, 5)),
               *(round(line.order) for line in lines)}
-    rates = {"t": _rates(fit, [s["t"] for s in signals], step)}
+    rates = {"t": _rates(fit, times := [s["t"] for s in signals], step),
+             **{name: _rates(fit, times, step, SWINGS, name == "beat") for name in ("swing", "beat")}}
     if "theta" in ranges:  # a belt, a gear's slow shaft: whole orders of a turn are its own
         travel = float(np.ptp(ranges["theta"]))
         cell = max(2 * np.pi / FINEST, travel / max(len(s["theta"]) for s in signals))
@@ -184,22 +194,26 @@ def load_of(system: System) -> str:
     return next((n for n, share in LOADS.items() if f"omega_{n}" in system.states and share in system.parameters), "")
 
 
-def _rates(fit: Fit, along: Sequence[Array], step: float) -> list[float]:
-    """Return the rates of lines over a quantity that stand out of the spectrum of the misfit, the strongest first."""
+def _rates(fit: Fit, along: Sequence[Array], step: float, least: int = 0, shares: bool = False) -> list[float]:
+    """Return the rates of lines over a quantity that stand out of the spectrum of the misfit, or of its shares of what
+    is simulated, the strongest first; of those from the `least` on with less to spare: each is fitted."""
     from scipy.ndimage import median_filter  # slow to import, and not needed before
 
-    length = 1 << int(max(np.ptp(z) for z in along) / step + 1).bit_length()
+    finer = FINER if least else 1
+    length = finer << int(max(np.ptp(z) for z in along) / step + 1).bit_length()
     power = np.zeros(length // 2 + 1)
     for run, sim, z in zip(fit.problem.runs, fit.simulations, along, strict=True):
         even = z.min() + step * np.arange(max(np.ptp(z) // step, 1))
         for c, sigma in run.sigma.items():
             known = np.flatnonzero(np.isfinite(residual := sim.residual(c)))
             rows = known[np.argsort(z[known], kind="stable")]
-            error = np.interp(even, z[rows], residual[rows]) / sigma
+            each = residual * (y / float(np.std(y)) if shares and np.std(y := sim.outputs[c]) else 1.0)
+            error = np.interp(even, z[rows], each[rows]) / sigma
             power += np.abs(np.fft.rfft((error - error.mean()) * np.hanning(len(even)), length)) ** 2
-    around = np.log(2) * power / np.maximum(median_filter(power, AROUND), 1e-300)  # of noise, 1 in the mean
-    around[: KNOTS + 2] = 0.0  # cosines over the range do that
-    top = (around[1:-1] >= around[:-2]) & (around[1:-1] >= around[2:]) & (around[1:-1] > 2 * np.log(length))
+    around = np.log(2) * power / np.maximum(median_filter(power, AROUND * finer), 1e-300)  # of noise, 1 in the mean
+    around[: least * finer or KNOTS + 2] = 0.0  # cosines over the range do that
+    chance = (1 if least else 2) * np.log(length)
+    top = (around[1:-1] >= around[:-2]) & (around[1:-1] >= around[2:]) & (around[1:-1] > chance)
     return [float(2 * np.pi * k / (length * step)) for k in sorted(1 + np.flatnonzero(top), key=lambda k: -power[k])]
 
 
@@ -275,6 +289,8 @@ def functions_of(form: Form, span: Span) -> list[str]:
                 found += [f"({sign}z > 0) * ca.exp(-ca.fabs(z) / {fade})" for fade in fades]
         return found
     found = (_along if form.on in ("theta", "t", "distance") else _of_size)(form, span, low, high)
+    if form.swings:
+        return [f for f in found if "ca.sin(" in f]
     if form.carrier != "acceleration" and not form.channel == form.on in span.unscaled:
         return found
     middle = f"{0.5 * max(low, high, key=abs) if form.on in ('i', 'omega') else 0.5 * (low + high):.9g}"
@@ -321,8 +337,14 @@ def _along(form: Form, span: Span, low: float, high: float) -> list[str]:
     top = f"{max(abs(low), abs(high)):.6g}"  # a slope, a spring that hardens, a stop, a slack, a ramp
     sudden += [*(f"(z / {top})**{k}" for k in (1, 2, 3)), *(f"ca.fmax((z - {c}) / {top}, 0)" for c in centres)]
     unit, reach = "rad/s" if form.on == "t" else "1:wave", 2 * np.pi / (high - low)
+    rates = span.rates.get(form.swings or form.on, ())
+    rates = [k * w for w in rates[:1] for k in range(1, OVERTONES + 1)] if form.swings else rates
     sudden += [f"ca.sin({_place(w, w - reach, w + reach, unit)} * z + {_place(phase, -4, 4, 'rad:phase')})"
-               for w in span.rates.get(form.on, ()) for phase in (0, np.pi / 2)]  # what swings, or repeats, by itself
+               for w in rates for phase in (0, np.pi / 2)]  # what swings, or repeats, by itself
+    wave = f"ca.sin({_place(rates[0], 0.9 * rates[0], 1.1 * rates[0], unit)} * z" if form.swings else ""
+    sudden += [f"ca.tanh({SUDDEN} * ({wave} + {_place(phase, phase - 1, phase + 1, 'rad:phase')})"
+               f" - {_place(level, -0.99, 0.99, '1:level')}))" for phase in np.arange(8) * np.pi / 4
+               for level in (-0.7, 0.0, 0.7) if wave and span.finer > 1]  # what is switched on and off
     if form.on != "theta":  # what warms up, or runs in
         whole = high - low
         sudden += [f"ca.exp(-z / {_place(whole / k, whole / 300, whole * 10)})" for k in FADES]
@@ -474,14 +496,16 @@ class Linear:
 
 def linearised(fit: Fit, only: Form | None = None, span: Span | None = None,
                zeros: Mapping[str, float] | None = None) -> Linear:
-    """Return the model of `fit` on its records with the forms that these can show, or `only` one over a span; a turn
-    begins at these `zeros` (`zeros_of`). SimulationError where its answer to small changes grows without bound."""
+    """Return the model of `fit` on its records with the forms that these can show, or `only` one over a span, whose
+    angle or time begins at these `zeros` (`zeros_of`). SimulationError where its answer to small changes grows without
+    bound."""
     problem = fit.problem
     residual, jac = _at(problem, fit)
     signals = signals_along(fit)
-    if zeros:
+    if only and zeros:
         firsts = problem.unknowns.firsts
-        signals = [{**s, "turn": s["turn"] + zeros.get(f"z_0[{k}]", 0.0)} for s, k in zip(signals, firsts, strict=True)]
+        signals = [{**s, only.on: s[only.on] + zeros.get(f"z_0[{k}]", 0.0)}
+                   for s, k in zip(signals, firsts, strict=True)]
     span = span or span_of(fit, signals)
     forms = [f for f in FORMS if shown(f, fit, span.ranges)] if only is None else [only]
     free, n, runs = len(problem.model.free_names), problem.n_outputs, range(len(signals))
@@ -603,6 +627,17 @@ def may_be_zeroed(fit: Fit) -> bool:
     return min(travels := _travels(fit, signals)) > 1 and max(travels) > 2 * np.pi
 
 
+def swinging(fit: Fit, forms: Iterable[Form]) -> list[Form]:
+    """Return the `forms` over the time, as waves whose phase is another in every run, that whole records could show:
+    one stands out of what is left."""
+    whole = fit.window is None and 1 < len(set(firsts := fit.problem.unknowns.firsts)) == len(firsts)
+    if not whole or fit.problem.unknowns.apart:
+        return []
+    rates = span_of(fit, signals_along(fit)).rates
+    waves = (replace(f, zeroed=True) for f in forms if f.on == "t" and f.carrier != "acceleration")
+    return [f for f in waves if rates[f.swings]]
+
+
 def _travels(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> list[float]:
     """Return how far every record goes, rad."""
     firsts = fit.problem.unknowns.firsts
@@ -616,13 +651,17 @@ def zeroed(fit: Fit, linear: Linear, form: Form) -> Linear:
 
 
 def zeros_of(fit: Fit, form: Form) -> dict[str, float]:
-    """Return the zero of the angle in every record but the first, by name: where its curve is most like the longest."""
+    """Return the zero of the angle or the time in every record but the first, by name: where its curve is most like the
+    longest, or where its strongest wave has the phase of the first."""
     signals, runs = signals_along(fit), sorted(set(fit.problem.unknowns.firsts))
-    span, most = span_of(fit, signals), int(np.argmax(_travels(fit, signals)))
-    own = form_coefficients(fit, zeroed(fit, linearised(fit), form), form)
-    angle = np.linspace(-np.pi, np.pi, 720, endpoint=False)
+    span = span_of(fit, signals)
+    own = form_coefficients(fit, zeroed(fit, linearised(fit), form), form).reshape(len(runs), -1)
+    if form.swings:
+        zeros = [float(phase) / span.rates[form.swings][0] for phase in np.angle(own[:, 0] + 1j * own[:, 1])]
+        return {f"z_0[{k}]": zero - zeros[0] for k, zero in zip(runs, zeros, strict=True) if k}
+    most, angle = int(np.argmax(_travels(fit, signals))), np.linspace(-np.pi, np.pi, 720, endpoint=False)
     waves = values_of(functions_of(form, span), form, {"turn": angle, "t": angle})
-    curves = waves[:, 1:] @ own.reshape(len(runs), -1)[:, 1:].T  # without the constant
+    curves = waves[:, 1:] @ own[:, 1:].T  # without the constant
     alike = np.fft.irfft(np.conj(np.fft.rfft(curves, axis=0)) * np.fft.rfft(curves[:, [most]], axis=0), axis=0)
     best = alike.argmax(axis=0)
     return {f"z_0[{k}]": float(angle[j] % (2 * np.pi) - np.pi) for k, j in zip(runs, best - best[0], strict=True) if k}

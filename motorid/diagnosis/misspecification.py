@@ -51,14 +51,17 @@ def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> l
     try:
         linear = free_forms.linearised(fit)
         answers = {form: Answers(fit, linear, form).predictions() for form in linear.forms}
-        if far(fit) and free_forms.may_be_zeroed(fit):
-            for form, plain in [(f, known) for f, known in answers.items() if f.on == "turn"]:
-                own = Answers(fit, free_forms.zeroed(fit, linear, form), form).predictions()
-                if plain and own and compare(plain, own).sure:  # one curve, shifted, is to do it, not its size alone
-                    shifted = free_forms.linearised(fit, form, zeros=free_forms.zeros_of(fit, form))
-                    one, size = Answers(fit, shifted, form).predictions(), answers.get(replace(form, on="run"))
-                    if one and compare(plain, one).sure and not (size and not compare(size, one).sure):
-                        answers[replace(form, zeroed=True)] = one
+        asked = [f for f in answers if f.on == "turn"] if far(fit) and free_forms.may_be_zeroed(fit) else []
+        asked += free_forms.swinging(fit, answers) if far(fit) else []
+        for form in asked:
+            plain, own = answers[replace(form, zeroed=False)], free_forms.zeroed(fit, linear, form)
+            known = Answers(fit, own, form).predictions()
+            if plain and known and compare(plain, known).sure:  # one curve, shifted, is to do it, not its size alone
+                shifted = free_forms.linearised(fit, form, zeros=free_forms.zeros_of(fit, form))
+                one = Answers(fit, shifted, form).predictions()
+                size = answers.get(replace(form, on="run", zeroed=False))
+                if one and compare(plain, one).sure and not (size and not compare(size, one).sure):
+                    answers[replace(form, zeroed=True)] = one
     except FAILURES:
         return []
     known, gains = predictive_score.predictions_left_out(rival, evenly=True) or {}, []
@@ -91,10 +94,13 @@ def hum_of(fit: Fit, gains: Sequence[FormGain]) -> str:
         return ""
     span = free_forms.span_of(fit, free_forms.signals_along(fit))
     waves = [k for k, f in enumerate(free_forms.functions_of(best.form, span)) if f.startswith("ca.sin(")]
-    alone = Answers(fit, free_forms.linearised(fit, best.form), best.form).predictions(waves) if waves else None
+    zeros = free_forms.zeros_of(fit, best.form) if best.form.swings else None
+    linear = free_forms.linearised(fit, best.form, zeros=zeros)
+    alone = Answers(fit, linear, best.form).predictions(waves) if waves else None
     if alone is None or compare(alone, best.predictions).worth_it:
         return ""
-    return f"a hum of {number(span.rates['t'][0] / 2 / np.pi, 3)} Hz in the sensor of {channel_name(best.form.channel)}"
+    hertz = number(span.rates[best.form.swings or "t"][0] / 2 / np.pi, 3)
+    return f"a hum of {hertz} Hz in the sensor of {channel_name(best.form.channel)}"
 
 
 class Answers:

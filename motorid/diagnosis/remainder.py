@@ -70,7 +70,7 @@ OTHER_PLACES = {"1": "where it sets in, a share of the largest", "V": "half of i
                 "rad/s": "how fast it swings, or half of its play", "1/rad": "how fast it turns over",
                 "1:wave": "how many to the turn", "rad:phase": "its phase", "rad:wide": "half of its width",
                 "rad:edge": "how wide its edges are", "1:damped": "how much its swing is damped",
-                "rad:slip": "how far it slips until what it drags along follows"}
+                "1:level": "how long it is on", "rad:slip": "how far it slips until what it drags along follows"}
 STRAIGHT = ("omega", "i", "v", *COUPLED)
 COUPLINGS = {"compliance", "backlash", "slip_clutch", "freewheel"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad", "rad²/s²": "·s²/rad²", "A²": "/A²"}
@@ -179,12 +179,13 @@ class Part:
         unit = "rad" if on in ("theta", "turn", "distance", "path") else "s"
         return unit, "how long it remembers" if on in PAST else "where it lies, bends, sets in or fades"
 
-    def law(self, names: Sequence[str], places: Sequence[str], known: Container[str]) -> str:
+    def law(self, names: Sequence[str], places: Sequence[str], known: Container[str], phase: str = "0.0") -> str:
         """Return the law as source, coefficients and places by name; states of `known` quantities are there already."""
         form, terms, own = self.form, self.terms(places), names[0]
         state, begins, rate = STATES.get(form.on, ("", "", ""))
         step = f"{self.span.step / (INPUT_AT_ONCE if form.on == 'past v' else AT_ONCE):.6g}"
-        lines = [f"z = {state or QUANTITIES[form.on].format(load=self.span.load)}"]
+        begun = f" + {phase} / {self.span.rates[form.swings][0]:.9g}" if form.swings else ""
+        lines = [f"z = {state or QUANTITIES[form.on].format(load=self.span.load)}{begun}"]
         if state and form.on not in known:
             lines = [f"{state} = m.state('{own}_{state}', {begins})",
                      f"m.rate({state}, {rate.format(step=step)})", *lines]
@@ -248,6 +249,8 @@ class Curve:
             parameters += [P(min(max(c, low), high), unit.partition(":")[0], lower=low, upper=high, given=True,
                              doc=words if unit == usual else OTHER_PLACES[unit])(n)
                            for (n, c), (_, low, high, unit) in zip(places, part.places, strict=True)]
+        if any(part.form.swings for part in self.parts):
+            parameters.append(P(0.0, "rad", null=0.0, per_run=True, doc="relative to the first run")(self.phase))
         return Effect(self.name, Law(self.law), tuple(parameters), self.balance, f"What is left: {self.text}.")
 
     def _apart(self, what: Iterable[Any]) -> Iterator[tuple[Part, list[Any], list[Any]]]:
@@ -265,6 +268,11 @@ class Curve:
     def sizes(self) -> dict[str, float]:
         """Coefficients and places by name."""
         return {f"{self.name}_{k}": c for k, c in enumerate(self.values)}
+
+    @property
+    def phase(self) -> str:
+        """Name of the phase of what swings, in every run another."""
+        return f"{self.name}_phase"
 
     @property
     def balance(self) -> str:
@@ -300,6 +308,10 @@ class Curve:
             return []
         z, value = self.points
         forms, unit = _closed_forms(part.form.on, z), part.unit(self.fit)
+        if part.form.swings:
+            places = zip(next(self._apart(self.values))[2], part.places, strict=True)
+            rates = [w for w, (*_, kind) in places if kind == "rad/s"] or part.span.rates[part.form.swings]
+            forms = [(f"a wave of {number(w / 2 / np.pi, 3)} Hz", [np.sin(w * z), np.cos(w * z)]) for w in rates]
         if part.form.on in PAST:
             functions = [*part.placed(next(self._apart(self.values))[2]),
                          *free_forms.functions_of(part.form, part.span)]
@@ -327,14 +339,17 @@ class Curve:
 
     @cached_property
     def _signals(self) -> list[dict[str, Array]]:
-        return free_forms.signals_along(self.fit)
+        zeros, firsts = self._zeros, self.fit.problem.unknowns.firsts
+        return [{**s, "t": s["t"] + zeros.get(f"z_0[{k}]", 0.0)}
+                for s, k in zip(free_forms.signals_along(self.fit), firsts, strict=True)]
 
     def grown(self) -> "Curve | None":
         """Return the curve with functions of its last part that predict more, fitted, or None; raises as a fit."""
         last, (*before, part) = self.fitted or self.fit, self.parts
         if part.by_run and part.chosen:
             return None
-        linear = free_forms.linearised(last, part.form, part.span)
+        zeros = {} if not part.form.swings else self._zeros or free_forms.zeros_of(last, part.form)
+        linear = free_forms.linearised(last, part.form, part.span, zeros)
         if part.by_run:
             first, *own = free_forms.form_coefficients(last, linear, part.form).tolist()
             curve = replace(self, parts=(*before, replace(part, chosen=(0,))), values=(*self.values, 0.0))
@@ -350,7 +365,16 @@ class Curve:
         first = self.values[: len(self.values) - len(part.chosen) - len(part.places)]
         curve, without = (replace(self, parts=(*before, larger), values=(*first, *sizes, *new, *places))
                           for new in (free, [0.0] * len(more)))
-        return curve.refitted(last, curve.sizes, without.sizes)
+        rate = part.span.rates[part.form.swings][0] if zeros else 0.0
+        phases = {n.replace("z_0", self.phase): zero * rate for n, zero in zeros.items()}
+        return curve.refitted(last, curve.sizes | phases, without.sizes | phases)
+
+    @property
+    def _zeros(self) -> dict[str, float]:
+        """The zero of the time in every run but the first, as fitted."""
+        fitted = self.fitted.initial if self.fitted else {}
+        rate = next((part.span.rates[part.form.swings][0] for part in self.parts if part.form.swings), 1.0)
+        return {n.replace(self.phase, "z_0"): phase / rate for n, phase in fitted.items() if n.startswith(self.phase)}
 
     def without(self, k: int) -> "Curve | None":
         """Return the curve without a part, fitted anew; None where that fails."""
@@ -383,7 +407,7 @@ class Curve:
     @property
     def law(self) -> str:
         """The law as source."""
-        return "\n".join(part.law(sizes, places, [before.form.on for before in self.parts[:k]])
+        return "\n".join(part.law(sizes, places, [before.form.on for before in self.parts[:k]], self.phase)
                          for k, (part, sizes, places) in enumerate(self._apart(self.sizes)))
 
 
@@ -492,7 +516,8 @@ class Remainder:
         """Return the same with the forms of its curve first, or none where no curve helps. Raises OutOfTime."""
         best = self._best
         zeros = best is not None and any(map(tells_the_zero, best.curve.fit.model.effects))  # another in every run
-        lead = [replace(p.form, zeroed=zeros and p.form.on == "turn") for p in best.curve.parts] if best else []
+        lead = [replace(p.form, zeroed=bool(p.form.swings) or (zeros and p.form.on == "turn"))
+                for p in best.curve.parts] if best else []
         found = replace(self, forms=tuple(dict.fromkeys((*lead, *self.forms))) if lead else ())
         with contextlib.suppress(OutOfTime):
             check_time()
@@ -605,8 +630,9 @@ def _beyond(base: Fit | None) -> Iterator[tuple[Curve, Form]]:
 def _over_zeros(base: Fit, forms: Iterable[Form]) -> Iterator[tuple[Curve, Form]]:
     """Yield a model, without a curve yet, with each form, beside the zero of every run where the form has one."""
     for form in forms:
-        if (fit := _zeroed(base, free_forms.zeros_of(base, form)) if form.zeroed else base) is not None:
-            yield Curve(fit, name=_name(base)), replace(form, zeroed=False)
+        turns = form.zeroed and not form.swings
+        if (fit := _zeroed(base, free_forms.zeros_of(base, form)) if turns else base) is not None:
+            yield Curve(fit, name=_name(base)), replace(form, zeroed=bool(form.swings))
 
 
 def _zeroed(base: Fit, zeros: Mapping[str, float]) -> Fit | None:
@@ -620,7 +646,8 @@ def _grown_in(there: Fit | None, base: Fit, asked: Sequence[Form]) -> Iterator[t
     """Yield curves, best first, of forms that grew in short windows or are `asked`."""
     if there is not None:
         here, found = HeldOut.of(there, None), dict[Any, Grown]()
-        also = ((Curve(there), f) for f in asked[:AHEAD] if not f.remembers and f.on not in ("distance", "run"))
+        also = ((Curve(there), f) for f in asked[:AHEAD]
+                if not (f.remembers or f.swings or f.on in ("distance", "run")))
         tried = ((replace(curve, trial=True), form) for curve, form in chain(islice(_beyond(there), TRIED), also))
         _race(found, tried, here.predictions(there), here, True)
         for key in sorted(found, key=lambda key: -found[key].gained.gain):

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from battery.excite import driven, record, voltages
 from command import motorid_json
+from lab_records import NOISE, VALUES, noisy
 
 import motorid as mi
 from motorid.channels import COMPUTED_INPUTS
@@ -1683,3 +1684,61 @@ def test_an_axis_without_friction_has_no_short_windows(rubbed):
     fit = mi.fit(mi.torque_driven().fix(b=0), turned)
     assert fit.nrmse["omega"] > 0.2
     assert over_moments(fit) is None
+
+
+@mi.effect(balance="torque")
+def shaken(m, a=mi.P(8e-3, "N·m", null=0.0), w=mi.P(14.0, "rad/s"), phi=mi.P(0.0, "rad")):
+    """A load that swings by itself."""
+    m.torque -= a * ca.sin(w * clock_of(m) + phi)
+
+
+@mi.effect(balance="sensor")
+def humming(m, a=mi.P(0.1, "A", null=0.0), w=mi.P(100 * np.pi, "rad/s"), phi=mi.P(0.0, "rad")):
+    """Mains hum in the channel of the current."""
+    m.measure("i", m.measured("i") + a * ca.sin(w * clock_of(m) + phi))
+
+
+@mi.effect(balance="voltage")
+def switched(m, a=mi.P(0.15, "", null=0.0), w=mi.P(20.0, "rad/s"), phi=mi.P(0.0, "rad")):
+    """Another machine at the same supply, on and off."""
+    m.scale("v", 1 - a * (1 + ca.tanh(30 * (ca.sin(w * clock_of(m) + phi) - 0.4))) / 2)
+
+
+def clock_of(m):
+    """The time since the start, as a state."""
+    clock = m.state("clock")
+    m.rate(clock, 1.0)
+    return clock
+
+
+@pytest.mark.parametrize(("effect", "what", "rate", "most"), [
+    (shaken, "a load", 14.0, 1.05), (humming, "an error of the current sensor", 100 * np.pi, 1.05),
+    (switched, "a gain of the voltage", 20.0, 2.5)])  # sharp edges
+def test_what_swings_by_itself_has_another_phase_in_every_run(effect, what, rate, most, tmp_path):
+    """They were called fluctuations that nothing predicts, 3 to 10 times the noise."""
+    t, rng, runs, clean = np.arange(1200) * 2e-3, np.random.default_rng(4), [], []
+    motor = mi.dc_motor(**VALUES)
+    for phase in (0.3, 2.0, 4.5, 1.2):
+        v = np.repeat(rng.uniform(-6, 6, 12), 100)
+        clean.append(mi.planned(motor + effect(phi=phase), t, v, channels=("i", "omega")))
+        runs.append(noisy(clean[-1].with_(sigma={}, name=f"phase {phase}"), rng))
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs[:3]), runs[3], effects=("coulomb", "constant_load"))
+    text = f"{what} that changes with the time in waves whose phase is another in every run"
+    if effect is humming:
+        assert found.verdict == "adequate"
+        assert found.answer.endswith("larger than the noise: a hum of 50 Hz in the sensor of current.")
+    else:
+        assert found.verdict == "unexplained"
+        assert text in found.text
+    assert found.effects == ()
+    assert found.remainder.as_effect().doc == f"What is left: {text}."
+    hertz = float(found.remainder.nearest()[0][0].split()[3])
+    assert 2 * np.pi * hertz == pytest.approx(rate, rel=0.01)
+    (tmp_path / "own.py").write_text(found.remainder.code(), encoding="utf-8")
+    again = mi.fit(found.remainder.model + own_effects(tmp_path / "own.py")["remainder"], runs[:3])
+    assert next(iter(again.per_run))
+    for fit in (found.remainder.fitted, again):
+        left = mi.evaluate(fit, runs[3]).rmse
+        assert all(left[c] < most * NOISE[c] for c in left), left
+    own = again.per_run["remainder_phase"]
+    assert [own[r.name]["value"] % (2 * np.pi) for r in runs[1:3]] == pytest.approx([1.7, 4.2], abs=0.3)
