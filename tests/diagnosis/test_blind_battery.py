@@ -20,7 +20,8 @@ from motorid.effects import EVERY, LIBRARY
 RUN = Path(__file__).parents[1] / "battery" / "blind" / "run.py"
 
 
-LATER = {"driver_voltage_limit", "driver_lag", "speed_filter", "driver_slew", "pwm_coast", "pwm_fast_decay",
+LATER = {"current_average", "driver_voltage_limit", "driver_lag", "speed_filter", "driver_slew", "pwm_coast",
+         "pwm_fast_decay",
          "slip_clutch", "freewheel", "end_stop", "speed_ripple", "driver_one_quadrant", "angle_lag"}  # than these
 
 
