@@ -10,8 +10,7 @@ from pathlib import Path
 
 from motorid.acquire.client import Client, LinkLost
 from motorid.acquire.protocol import Header, Message, Sample, frame
-from motorid.acquire.record_file import Commanded, RecordFile
-from motorid.acquire.timeline import Row, Timeline
+from motorid.acquire.record_file import Commanded, RecordFile, Row, Timeline
 from motorid.display.cards import Card, Flag, Shown
 
 OVER_LIMIT = 3  # samples in a row beyond a limit that make the computer stop the motor too

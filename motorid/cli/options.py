@@ -29,7 +29,7 @@ from motorid.numerics.parallel import interruption
 from motorid.problem.constraints import CurrentLimit, SteadyState
 from motorid.records.checks import as_command, check_runs, reading_notes
 from motorid.records.experiment import Experiment
-from motorid.records.layout import parse_pairs
+from motorid.records.headers import parse_pairs
 from motorid.records.reading import read_runs
 
 _reading = functools.partial(typer.Option, rich_help_panel="Reading")

@@ -80,8 +80,7 @@ def certain(fit: Fit) -> dict[str, float | None]:
 
 
 def undetermined(fit: Fit, effect: Effect, wholly: bool = False) -> str:
-    """Say which parameters of an effect the records leave open, as voltages too, `wholly` only if those are all that it
-    has; empty for none."""
+    """Say which parameters of an effect the records leave open, as voltages too, `wholly` only if it has no others."""
     own = [p for p in effect.parameters if fit.problem.model.parameters[p.name].vary]
     known = {n for n, s in (certain(fit) if wholly else fit.std).items() if s is not None}
     found = [p.name for p in own if not p.per_run and not {p.name, f"{p.name}_voltage"} & {*known, *fit.determined}]

@@ -68,8 +68,7 @@ CHANGES = {"t": "changes with the time", "distance": "changes with the distance 
            "since_reversal": "depends on the time since the voltage was reversed"}
 PAST = (*(on for on in CHANGES if on.startswith("past ")), "path")
 MEMORIES = 8  # lengths of memory
-OVERTONES = 5  # of what swings, or is switched, at a rate of its own
-SWINGS = 4  # at least in a record: what is slower is a drift
+SWINGS, OVERTONES = 4, 5  # at least in a record (what is slower is a drift), and at most in a swing
 TRIPS = (0.02, 0.05, 0.1, 0.2, 0.4)  # of the largest heat: where a fuse or a derating sets in
 PLAY = (0.01, 0.4)  # of the largest value: half of the least and of the largest play
 DAMPED = 0.1  # share of the critical damping with which what swings begins
@@ -199,7 +198,7 @@ def _rates(fit: Fit, along: Sequence[Array], step: float, least: int = 0, shares
     is simulated, the strongest first; of those from the `least` on with less to spare: each is fitted."""
     from scipy.ndimage import median_filter  # slow to import, and not needed before
 
-    finer = FINER if least else 1
+    finer, chance = (FINER, 1.0) if least else (1, 2.0)
     length = finer << int(max(np.ptp(z) for z in along) / step + 1).bit_length()
     power = np.zeros(length // 2 + 1)
     for run, sim, z in zip(fit.problem.runs, fit.simulations, along, strict=True):
@@ -212,8 +211,7 @@ def _rates(fit: Fit, along: Sequence[Array], step: float, least: int = 0, shares
             power += np.abs(np.fft.rfft((error - error.mean()) * np.hanning(len(even)), length)) ** 2
     around = np.log(2) * power / np.maximum(median_filter(power, AROUND * finer), 1e-300)  # of noise, 1 in the mean
     around[: least * finer or KNOTS + 2] = 0.0  # cosines over the range do that
-    chance = (1 if least else 2) * np.log(length)
-    top = (around[1:-1] >= around[:-2]) & (around[1:-1] >= around[2:]) & (around[1:-1] > chance)
+    top = (around[1:-1] >= around[:-2]) & (around[1:-1] >= around[2:]) & (around[1:-1] > chance * np.log(length))
     return [float(2 * np.pi * k / (length * step)) for k in sorted(1 + np.flatnonzero(top), key=lambda k: -power[k])]
 
 
@@ -496,9 +494,8 @@ class Linear:
 
 def linearised(fit: Fit, only: Form | None = None, span: Span | None = None,
                zeros: Mapping[str, float] | None = None) -> Linear:
-    """Return the model of `fit` on its records with the forms that these can show, or `only` one over a span, whose
-    angle or time begins at these `zeros` (`zeros_of`). SimulationError where its answer to small changes grows without
-    bound."""
+    """Return the model of `fit` on its records with the forms that these can show, or `only` one over a span, begun at
+    these `zeros` (`zeros_of`). SimulationError where its answer to small changes grows without bound."""
     problem = fit.problem
     residual, jac = _at(problem, fit)
     signals = signals_along(fit)
@@ -628,10 +625,9 @@ def may_be_zeroed(fit: Fit) -> bool:
 
 
 def swinging(fit: Fit, forms: Iterable[Form]) -> list[Form]:
-    """Return the `forms` over the time, as waves whose phase is another in every run, that whole records could show:
-    one stands out of what is left."""
-    whole = fit.window is None and 1 < len(set(firsts := fit.problem.unknowns.firsts)) == len(firsts)
-    if not whole or fit.problem.unknowns.apart:
+    """Return `forms` over the time, as waves whose phase is another in every run, that stand out of whole records."""
+    known = fit.problem.unknowns
+    if fit.window or known.apart or not 1 < len(set(known.firsts)) == len(known.firsts):
         return []
     rates = span_of(fit, signals_along(fit)).rates
     waves = (replace(f, zeroed=True) for f in forms if f.on == "t" and f.carrier != "acceleration")

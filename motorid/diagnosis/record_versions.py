@@ -55,7 +55,7 @@ def affordable(fit: Fit) -> Fit:
     if fit.problem.initial != "auto":
         return fit
     k = 1  # a power of two: every k-th sample tells as much as all do, but for noise
-    while _samples(fit.problem.experiments) >= 2 * k * ENOUGH and _predicted(fit, 2 * k):
+    while samples_of(fit.problem.experiments) >= 2 * k * ENOUGH and _predicted(fit, 2 * k):
         k *= 2
     if k > 1:
         fit = fitted_to(fit, [r.decimate(k).with_(meta={**r.meta, "every": k}) for r in fit.problem.experiments])
@@ -79,12 +79,7 @@ def thinned_alike(fit: Fit, runs: Sequence[Experiment]) -> list[Experiment]:
 def whole_of(fit: Fit, records: Sequence[Experiment]) -> list[Experiment]:
     """Return whole `records`, as many samples of each, where a fit is of parts of them that are not much shorter."""
     parts, runs = fit.problem.experiments, thinned_alike(fit, records)
-    return runs if any("part of" in r.meta for r in parts) and _samples(runs) <= WHOLE * _samples(parts) else []
-
-
-def thinned(fit: Fit, records: Sequence[Experiment]) -> bool:
-    """Tell whether a fit is of every few samples of `records`."""
-    return 1 < _samples(records) / _samples(fit.problem.experiments) <= WHOLE and not whole_of(fit, records)
+    return runs if any("part of" in r.meta for r in parts) and samples_of(runs) <= WHOLE * samples_of(parts) else []
 
 
 def fitted_to(fit: Fit, runs: Sequence[Experiment] | None, effort: LevenbergMarquardt | None = None) -> Fit:
@@ -115,11 +110,11 @@ def _predicted(fit: Fit, k: int) -> bool:
 
 def fit_affordably(runs: Sequence[Experiment], fit: Callable[[Sequence[Experiment]], Fit]) -> Fit:
     """Return the fit of `runs` to begin a diagnosis with: of parts, where to fit all would take long."""
-    total = _samples(runs)
+    total = samples_of(runs)
     if (parts := parts_of(runs, FEW / total) if total > LONG else None) is None:
         return fit(runs)
     few = fit(parts)
-    if (work := _work(few) * total / _samples(parts)) <= AFFORDABLE or few.problem.initial != "auto":
+    if (work := _work(few) * total / samples_of(parts)) <= AFFORDABLE or few.problem.initial != "auto":
         return fit(runs)
     wanted = parts_of(runs, WANTED / work)
     return few if wanted is None or len(wanted) == len(parts) else fit(wanted)
@@ -128,7 +123,7 @@ def fit_affordably(runs: Sequence[Experiment], fit: Callable[[Sequence[Experimen
 def parts_of(runs: Sequence[Experiment], share: float) -> list[Experiment] | None:
     """Return parts of records that together are about a `share` of them; None where that is nearly all."""
     parts = [p for run in runs for p in _parts(run, share)]
-    return parts if _samples(parts) < NEARLY_ALL * _samples(runs) else None
+    return parts if samples_of(parts) < NEARLY_ALL * samples_of(runs) else None
 
 
 def _parts(run: Experiment, share: float) -> list[Experiment]:
@@ -187,7 +182,8 @@ def parts_remark(fit: Fit) -> str:
             f"the model to all of them. {thin}".rstrip())
 
 
-def _samples(runs: Sequence[Experiment]) -> int:
+def samples_of(runs: Sequence[Experiment]) -> int:
+    """Return how many samples all runs have."""
     return sum(r.n for r in runs)
 
 

@@ -13,14 +13,12 @@ from motorid.diagnosis.predictive_score import QUICK, ROUGH
 from motorid.diagnosis.score_test import uses_angle
 from motorid.diagnosis.thresholds import MATERIAL, NATS
 from motorid.errors import OutOfTime, otherwise
-from motorid.estimation.continuation import by_continuation, past_ripples, sharpened
-from motorid.estimation.first_guess import first_guess
+from motorid.estimation.continuation import by_continuation, collapsed_again, past_ripples, restored, sharpened
 from motorid.estimation.fit import LOST, lost
 from motorid.estimation.least_squares import FAILURES, Estimate, cost_at
 from motorid.estimation.linearisation import Tangent
-from motorid.estimation.restarts import collapsed_again, restored
 from motorid.estimation.result import Fit
-from motorid.estimation.start_values import ABOVE, exchanged_poles, sizes_like
+from motorid.estimation.start_values import ABOVE, exchanged_poles, first_guess, sizes_like
 from motorid.model.definition import Effect
 from motorid.model.model import Model
 from motorid.numerics.least_squares import LevenbergMarquardt

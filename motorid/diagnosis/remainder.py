@@ -154,8 +154,7 @@ class Part:
         return functions
 
     def terms(self, places: Iterable[Any]) -> list[str]:
-        """The same as source. Few functions are a law, which goes on, in a balance straight as R·i; of many nothing is
-        known beyond."""
+        """The same as source. Few functions are a law, which goes on, in a balance straight."""
         terms = [PLACE.sub(r"\1", f) for f in self.placed(places)]
         straight = [CLIPPED.sub("z", f) if self.moved and self.form.on in STRAIGHT else f for f in terms]
         each = zip(terms, straight, strict=True)
@@ -250,7 +249,7 @@ class Curve:
                              doc=words if unit == usual else OTHER_PLACES[unit])(n)
                            for (n, c), (_, low, high, unit) in zip(places, part.places, strict=True)]
         if any(part.form.swings for part in self.parts):
-            parameters.append(P(0.0, "rad", null=0.0, per_run=True, doc="relative to the first run")(self.phase))
+            parameters.append(P(0.0, "rad", null=0.0, per_run=True, doc="against the first")(f"{self.name}_phase"))
         return Effect(self.name, Law(self.law), tuple(parameters), self.balance, f"What is left: {self.text}.")
 
     def _apart(self, what: Iterable[Any]) -> Iterator[tuple[Part, list[Any], list[Any]]]:
@@ -268,11 +267,6 @@ class Curve:
     def sizes(self) -> dict[str, float]:
         """Coefficients and places by name."""
         return {f"{self.name}_{k}": c for k, c in enumerate(self.values)}
-
-    @property
-    def phase(self) -> str:
-        """Name of the phase of what swings, in every run another."""
-        return f"{self.name}_phase"
 
     @property
     def balance(self) -> str:
@@ -339,9 +333,8 @@ class Curve:
 
     @cached_property
     def _signals(self) -> list[dict[str, Array]]:
-        zeros, firsts = self._zeros, self.fit.problem.unknowns.firsts
-        return [{**s, "t": s["t"] + zeros.get(f"z_0[{k}]", 0.0)}
-                for s, k in zip(free_forms.signals_along(self.fit), firsts, strict=True)]
+        each, zeros = free_forms.signals_along(self.fit), self._zeros  # of whole runs
+        return [{**s, "t": s["t"] + zeros.get(f"z_0[{k}]", 0.0)} for k, s in enumerate(each)]
 
     def grown(self) -> "Curve | None":
         """Return the curve with functions of its last part that predict more, fitted, or None; raises as a fit."""
@@ -365,8 +358,8 @@ class Curve:
         first = self.values[: len(self.values) - len(part.chosen) - len(part.places)]
         curve, without = (replace(self, parts=(*before, larger), values=(*first, *sizes, *new, *places))
                           for new in (free, [0.0] * len(more)))
-        rate = part.span.rates[part.form.swings][0] if zeros else 0.0
-        phases = {n.replace("z_0", self.phase): zero * rate for n, zero in zeros.items()}
+        rate, own = part.span.rates.get(part.form.swings, [1.0])[0], f"{self.name}_phase"
+        phases = {n.replace("z_0", own): zero * rate for n, zero in zeros.items()}
         return curve.refitted(last, curve.sizes | phases, without.sizes | phases)
 
     @property
@@ -374,7 +367,7 @@ class Curve:
         """The zero of the time in every run but the first, as fitted."""
         fitted = self.fitted.initial if self.fitted else {}
         rate = next((part.span.rates[part.form.swings][0] for part in self.parts if part.form.swings), 1.0)
-        return {n.replace(self.phase, "z_0"): phase / rate for n, phase in fitted.items() if n.startswith(self.phase)}
+        return {n.replace(own, "z_0"): z / rate for n, z in fitted.items() if n.startswith(own := f"{self.name}_phase")}
 
     def without(self, k: int) -> "Curve | None":
         """Return the curve without a part, fitted anew; None where that fails."""
@@ -383,8 +376,7 @@ class Curve:
         return curve.refitted(self.fitted or self.fit, curve.sizes)
 
     def slimmed(self) -> "Curve | None":
-        """Return the curve without the functions that are within two deviations of nothing, fitted anew; None where
-        there are none of these, or that fails."""
+        """Return the curve without functions within two deviations of nothing, fitted anew; None for none of these."""
         parts, values, std = list[Part](), list[float](), self.fitted.std if self.fitted else {}
         for part, sizes, places in self._apart(self.sizes.items()):
             told = [(known := std.get(n, 0.0)) is not None and abs(c) > 2 * known for n, c in sizes]
@@ -407,7 +399,7 @@ class Curve:
     @property
     def law(self) -> str:
         """The law as source."""
-        return "\n".join(part.law(sizes, places, [before.form.on for before in self.parts[:k]], self.phase)
+        return "\n".join(part.law(sizes, places, [before.form.on for before in self.parts[:k]], f"{self.name}_phase")
                          for k, (part, sizes, places) in enumerate(self._apart(self.sizes)))
 
 

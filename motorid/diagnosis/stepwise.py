@@ -388,19 +388,19 @@ def _read_and_climbed(fit: Fit, held_out: Sequence[Experiment] | None,
 
 
 def _asking_for_all(found: Climb, whole: Fit, held_out: Sequence[Experiment] | None) -> set[str]:
-    """Return the effects to try on all records, where a model leaves noise of these and more of what was looked at:
-    all where one with a memory does, on the way or the most promising that was refused, as it begins anew in every part
-    of a record; those refitted where the last does, as a held voltage steps between the samples of thinned records. Not
-    where all would take more than `WHOLE` times as long."""
-    last, every, rounds = found.path[-1].fit, whole.problem.experiments, found.rounds
-    refused = (c for tried in rounds[-1:] for c in tried if c.fit is not None and c.fit.memories)
-    best, enough = max(refused, key=lambda c: c.gain or 0.0, default=None), found.remaining.adequate
-    fits = [node.fit for node in found.path[1:]]
-    fits = [f for f in (fits[:-1] if enough else [*fits, best and best.fit]) if f and f.memories]
-    runs = versions.whole_of(found.search.root.fit, every)
+    """Return the effects to try on all records, where a model leaves noise of these and more of what was looked at: all
+    for one with a memory, on the way or refused, as that begins anew in every part; those refitted for the last, as a
+    held voltage steps between thinned samples. Not where all would take more than `WHOLE` times as long."""
+    last, every, on_way = found.path[-1].fit, [*whole.problem.experiments], [node.fit for node in found.path[1:]]
+    refused = (c for tried in found.rounds[-1:] for c in tried if c.fit is not None and c.fit.memories)
+    best, root = max(refused, key=lambda c: c.gain or 0.0, default=None), found.search.root.fit
+    fits = on_way[:-1] if found.remaining.adequate else [*on_way, best and best.fit]
+    fits, runs = [f for f in fits if f and f.memories], versions.whole_of(root, every)
     looks = [(f, runs, {e.name for e in found.search.effects}) for f in fits if runs]
-    if far(last) and versions.thinned(last, every):
-        looks.append((last, every, {n for tried in rounds for c in tried if c.fit for n in c.effect.split(" + ")}))
+    longer = versions.samples_of(every) / versions.samples_of(last.problem.experiments)
+    if far(last) and not runs and 1 < longer <= versions.WHOLE:
+        tried = (c.effect for some in found.rounds for c in some if c.fit)
+        looks.append((last, every, {name for names in tried for name in names.split(" + ")}))
     for fit, records, effects in looks:
         with contextlib.suppress(*FAILURES):
             if at_noise(node_of(versions.fitted_to(fit, records, QUICK), HeldOut.of(whole, held_out))):

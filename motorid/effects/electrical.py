@@ -154,8 +154,7 @@ def driver_lag(m: Equations, T_v=P(5e-3, "s", null=0.0, positive=True, grid=(1.0
                                    doc="time constant of the driver's output")):
     """First-order lag of the driver: an output filter, a slow amplifier. Åström & Murray, Feedback Systems, 2008.
 
-    Seen as current and speed that are both late: quick steps, both measured. T_v and L/R may change places in a fit:
-    fix L where it is known."""
+    Seen as current and speed that are both late. T_v and L/R may change places in a fit: fix L where it is known."""
     z = m.state("v_lagged", m.base("R") * m.start["i"] + m.base("K") * m.start["omega"])  # holds it as it was
     m.rate(z, (m.v - z) / T_v)
     m.voltage -= m.v - z

@@ -14,9 +14,8 @@ import numpy as np
 from motorid.display.numbers import listed
 from motorid.errors import ModelError, UsageError, among, name_of, numbers_told, one_of, otherwise
 from motorid.estimation.angle_orders import effects_of_unknown_order, strongest_order, uses_angle
-from motorid.estimation.continuation import by_continuation
+from motorid.estimation.continuation import by_continuation, restore_collapsed
 from motorid.estimation.least_squares import FAILURES, FINISH, Callback, Estimate, least_squares, race
-from motorid.estimation.restarts import restore_collapsed
 from motorid.estimation.result import Fit
 from motorid.estimation.start_values import exchanged_poles, with_start_values
 from motorid.integrate.engine import Engine

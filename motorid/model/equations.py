@@ -94,8 +94,7 @@ class Equations:
     def input(self, name: str) -> ca.SX:
         """Return what was measured beside the voltage, e.g. ``"tau_load"``; the model's records must have it.
 
-        Computed from the voltage, in s: the time ``"since_change"``, ``"since_reversal"`` and ``"since_switch"``, the
-        last negative while it is off."""
+        Of the voltage, in s: the time ``"since_change"``, ``"since_reversal"``, ``"since_switch"`` (negative: off)."""
         among(name, (*MEASURED_INPUTS, *COMPUTED_INPUTS), "input", ModelError, f"{self.writer}: ")
         return self.inputs.setdefault(name, ca.SX.sym(name))
 

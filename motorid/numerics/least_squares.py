@@ -8,7 +8,7 @@ looks like a minimum. The usual D, column norms of J (Moré, 1978), hardly brake
 of e costs λ times the present misfit, so a parameter that the misfit does not ask for stays until its turn comes.
 Damping by ‖r‖² converges globally, and quadratically even where J is singular (Yamashita & Fukushima, Computing Suppl.
 15, 2001; Fan & Yuan, Computing 74, 2005). λ follows the gain ratio (Nielsen, IMM-REP-1999-05). Of 100 starts within a
-factor of ten 99 end in the optimum, 75 to 94 with the column norms; see `motorid.estimation.restarts`."""
+factor of ten 99 end in the optimum, 75 to 94 with the column norms; see `motorid.estimation.continuation`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -35,7 +35,7 @@ class LevenbergMarquardt:
     longest_step : float
         Largest change of one coordinate per iteration: e² on the logarithmic scale.
     looks : int
-        How often a fit restarts where its end is in doubt; see `motorid.estimation.restarts`.
+        How often a fit restarts where its end is in doubt; see `motorid.estimation.continuation`.
     patience, crawl : int, float
         Stop when `patience` steps lower the cost by less than `crawl` times ftol each.
 
@@ -122,8 +122,7 @@ def levenberg_marquardt(residual: Callable[[Array], Array], both: Callable[[Arra
 
     `residual` is ``q -> r`` (n,) and may raise `SimulationError`; `both` is ``q -> (r, jac)``, jac (n, nq), called at
     the start and after every accepted step only, so that it may refine what `residual` does there; the callback
-    (iteration, cost, q) is called then, too. FitError if the residual cannot be computed at the start, OutOfTime if
-    the budget of time around the call is spent."""
+    (iteration, cost, q) is called then, too. FitError without a residual at the start, OutOfTime once time is up."""
     o = options or LevenbergMarquardt()
     search = _Search(residual, both, np.asarray(q0, float), bounds, o, log)
     history, end, enough = [search.cost], "limit", o.patience * o.crawl * o.ftol

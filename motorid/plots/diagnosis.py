@@ -102,8 +102,7 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     """Draw the missing torque or voltage with what was added drawn over it, against the quantity that it acts on.
 
     Dots are samples of what the first model lacks, their mean and its interval of 95 % in bins; the line is what the
-    last model has instead: the accepted effects and the shift of the parameters. An effect with so many periods per
-    turn is drawn over one of them.
+    last model has instead: accepted effects, shifted parameters. What repeats within a turn is drawn over one period.
 
     Examples
     --------
@@ -277,8 +276,7 @@ def plot_design(design: Design) -> np.ndarray:
 
 @style.styled
 def plot_residuals(fit: Fit, channels: Sequence[str] | None = None) -> np.ndarray:
-    """Draw the residuals of each channel: over time, their histogram, their correlation with the input and with
-    themselves, against the model's ω, i, θ.
+    """Draw the residuals of each channel: over time, histogram, correlations, and against the model's ω, i, θ.
 
     Noise alone is flat: a histogram under the curve of the normal distribution, correlations within
     their bands of 95 %, means of zero against every quantity.

@@ -126,8 +126,7 @@ def initial_state(run: Experiment, sigma: Mapping[str, float],
 
     ``auto``: known zeros where nothing moves yet, otherwise estimated; a measured angle is estimated too: its first
     sample is as noisy as any, and half a count of the finest encoder shows over a long run. Estimates stay within what
-    the first samples allow, so that a model which lacks something cannot hide it in an initial state that never was.
-    ``estimate``: everything, without limits."""
+    the first samples allow, so that no model hides what it lacks in them. ``estimate``: everything, without limits."""
     among(initial, INITIAL, "initial state")
     rest, lead = at_rest(run, sigma)
     known = rest if initial == "auto" else initial == "rest"

@@ -12,7 +12,7 @@ from motorid.display.numbers import counted
 from motorid.errors import DataError, otherwise
 from motorid.numerics.signals import Array, fresh_means, going_on, repeats, unrounded
 from motorid.records.experiment import INPUTS, MIN_SAMPLES, PARTS, Experiment, pauses
-from motorid.records.layout import Layout, Place
+from motorid.records.headers import Layout, Place
 from motorid.records.preprocessing import unwrapped
 
 Texts = Mapping[str, Sequence[object]]

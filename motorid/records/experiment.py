@@ -202,8 +202,7 @@ class Experiment(Shown):
 
         Not next to jumps of the voltage, where the motor is quick; at least three, at most 5 % of a channel. Of speed
         and angle, two or three in a row that jump there and back are left out too, what jumps beyond all else and
-        fades, and zeros, up to a fifth, amid what stays far from them: a mass cannot. Of a part that a diagnosis looks
-        at those of the whole record are."""
+        fades, and zeros, up to a fifth, amid what stays far from them: a mass cannot. Of a part, those of the whole."""
         free, known = "tau_load" not in self.inputs, self.meta.get("spikes")  # a blow of the load may be as short
         outputs = {c: preprocessing.without_spikes(self.t, y, self.inputs["v"], inert=free and c != "i")
                    if known is None else np.where(np.isin(self.t, known.get(c, ())), np.nan, y)

@@ -13,13 +13,11 @@ from typing import Any
 import numpy as np
 
 from motorid.errors import DataError, UsageError, one_of, positive
-from motorid.records.binary_tables import FORMATS, frame_table, mat_table
 from motorid.records.cleaning import run_from_columns
 from motorid.records.experiment import Experiment, between_pauses
 from motorid.records.files import read_bytes, write_files
-from motorid.records.headers import classify
-from motorid.records.layout import assign, first_of_its_name, parse_pairs
-from motorid.records.text_tables import TextTable, parse_table
+from motorid.records.headers import assign, classify, first_of_its_name, parse_pairs
+from motorid.records.tables import FORMATS, TextTable, frame_table, mat_table, parse_table
 
 Path_ = str | os.PathLike[str]
 RECORDS = (".csv", ".txt", ".tsv", ".dat", ".log", *FORMATS)

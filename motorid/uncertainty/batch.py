@@ -201,8 +201,7 @@ def _row(found: Fit) -> dict[str, Any]:
 
 
 def motors_in(folder: str | Path) -> dict[str, list[Path]]:
-    """Return the records in a folder by motor: every subfolder is one, and so is every file beside them; DataError for
-    a folder that does not exist or holds none.
+    """Return the records in a folder by motor: each subfolder, each file beside them; DataError where there is none.
 
     Examples
     --------

@@ -33,8 +33,7 @@ EXACTLY = replace(SOLVER, ftol=1e-10)  # what priors say is a small part of the 
 class Bootstrap(Printed):
     """Refits to resampled records.
 
-    They start from the fit, so what the data do not determine hardly moves: its spread says nothing, and neither a
-    standard deviation nor an interval is given."""
+    They start from the fit, so what the data do not determine hardly moves: no deviation or interval is given."""
 
     kind: str
     names: tuple[str, ...]

@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 from motorid.acquire import excitation
 from motorid.acquire.excitation import Program, Segment, lfsr_bits, program
 from motorid.acquire.protocol import Channel, Decoder, Header, Message, Sample, crc16, frame
-from motorid.acquire.record_file import RecordFile, check_target, column, read_tail
+from motorid.acquire.record_file import RecordFile, Row, Timeline, check_target, column, read_tail
 from motorid.acquire.recorder import calibrate, read_calibration
-from motorid.acquire.timeline import Row, Timeline
 from motorid.errors import DataError, DeviceError, UsageError
 
 CHANNELS = (Channel("v", "V", 1e-3), Channel("i", "A", 0.005, 2048, "a12"),
@@ -450,7 +449,7 @@ def test_only_a_record_of_ours_is_continued(tmp_path):
 FULL_DISK = """
 import resource, signal, sys
 from pathlib import Path
-from motorid.acquire.timeline import Row
+from motorid.acquire.record_file import Row
 from motorid.acquire.protocol import Channel
 from motorid.acquire.record_file import RecordFile
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

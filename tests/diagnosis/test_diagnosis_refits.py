@@ -26,10 +26,9 @@ from motorid.diagnosis.results import Candidate
 from motorid.diagnosis.verdict import measured_angle_remark
 from motorid.effects import LIBRARY
 from motorid.errors import OutOfTime
-from motorid.estimation.continuation import by_continuation
+from motorid.estimation.continuation import MATTERS, by_continuation, collapsed_again, restored
 from motorid.estimation.fit import solve
 from motorid.estimation.least_squares import Estimate, least_squares
-from motorid.estimation.restarts import MATTERS, collapsed_again, restored
 from motorid.numerics.least_squares import LevenbergMarquardt
 from motorid.numerics.parallel import budget, one_thread
 from motorid.problem.problem import Problem

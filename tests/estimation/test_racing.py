@@ -48,6 +48,6 @@ def test_a_start_is_kept_inside_the_limits(problem):
 
 
 def test_weights_by_the_rms_do_not_make_a_parameter_that_matters_look_collapsed(problem, monkeypatch):
-    monkeypatch.setattr("motorid.estimation.restarts.race", lambda *_: pytest.fail("put back without need"))
+    monkeypatch.setattr("motorid.estimation.continuation.race", lambda *_: pytest.fail("put back without need"))
     fit = mi.fit(mi.dc_motor(), problem.experiments, weights="rms", initial="rest")
     assert fit.values["K"] == pytest.approx(TRUE["K"], rel=0.02)

@@ -10,9 +10,8 @@ import pytest
 
 import motorid as mi
 from motorid.errors import FitError, UsageError
-from motorid.estimation.shooting.mesh import Mesh, nodes_from_data, nodes_from_simulation
 from motorid.estimation.shooting.multiple_shooting import MultipleShooting
-from motorid.estimation.shooting.nlp import ShootingNlp
+from motorid.estimation.shooting.nlp import Mesh, ShootingNlp, nodes_from_data, nodes_from_simulation
 from motorid.estimation.shooting.outcome import steady_residual
 from motorid.problem.constraints import Constraint, CurrentLimit, SteadyState
 from motorid.records.datasets import truth

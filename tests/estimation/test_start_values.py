@@ -14,7 +14,7 @@ import motorid as mi
 from motorid.diagnosis import refit as trial
 from motorid.diagnosis.refit import refit
 from motorid.estimation import start_values
-from motorid.estimation.first_guess import _nonnegative, first_guess
+from motorid.estimation.start_values import _nonnegative, first_guess
 from motorid.problem.problem import Problem
 
 TRUTH = {"R": 2.0, "L": 1e-3, "K": 0.05, "b": 1e-5, "J": 2e-5}

@@ -18,8 +18,7 @@ from command import motorid
 
 import motorid as mi
 from motorid.acquire.protocol import Channel, frame
-from motorid.acquire.record_file import RecordFile
-from motorid.acquire.timeline import Row
+from motorid.acquire.record_file import RecordFile, Row
 from motorid.records.datasets import data_path
 
 RUN = data_path("two_step") / "step_6V.csv"

@@ -7,8 +7,7 @@ import math
 import pytest
 
 from motorid.errors import DataError, UsageError
-from motorid.records.headers import classify, is_duty, is_supply, parse_unit, require_unit
-from motorid.records.layout import assign, parse_pairs
+from motorid.records.headers import assign, classify, is_duty, is_supply, parse_pairs, parse_unit, require_unit
 
 KNOWN = {
     "t": "t|time|time_s|t_ms|Time [s]|timestamp_us|Zeit|Zeit in ms|t / s|time (ms)|Timestamp(us)|"

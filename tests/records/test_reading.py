@@ -17,7 +17,7 @@ from motorid.channels import CHANNELS, UNITS
 from motorid.errors import DataError, MissingDependency, UsageError
 from motorid.records.checks import check_runs
 from motorid.records.experiment import MIN_SAMPLES, Experiment
-from motorid.records.layout import parse_pairs
+from motorid.records.headers import parse_pairs
 from motorid.records.reading import find_records, read_csv, read_mat, read_runs, write_csv
 
 

@@ -14,8 +14,16 @@ from motorid.errors import FitError, SimulationError, UsageError, among, at_leas
 from motorid.estimation.fit import minimise
 from motorid.estimation.least_squares import FINISH, least_squares
 from motorid.estimation.result import Fit
-from motorid.estimation.shooting.mesh import Mesh, first_noise, nodes_from_data, nodes_from_simulation, noise_of_gaps
-from motorid.estimation.shooting.nlp import NlpResult, ShootingNlp, ipopt
+from motorid.estimation.shooting.nlp import (
+    Mesh,
+    NlpResult,
+    ShootingNlp,
+    first_noise,
+    ipopt,
+    nodes_from_data,
+    nodes_from_simulation,
+    noise_of_gaps,
+)
 from motorid.estimation.shooting.outcome import KEPT, Solved, below_steady, fit_of, violations
 from motorid.numerics.signals import Array
 from motorid.problem.constraints import Relation, Weighed

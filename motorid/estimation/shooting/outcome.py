@@ -10,8 +10,7 @@ import scipy
 from motorid.display.numbers import counted
 from motorid.errors import FitError, SimulationError
 from motorid.estimation.result import Fit
-from motorid.estimation.shooting.mesh import Mesh, gaps_of, reduced
-from motorid.estimation.shooting.nlp import NlpResult, ShootingNlp
+from motorid.estimation.shooting.nlp import Mesh, NlpResult, ShootingNlp, gaps_of, reduced
 from motorid.numerics.least_squares import LevenbergMarquardt, levenberg_marquardt
 from motorid.numerics.signals import Array
 from motorid.problem.constraints import CurrentLimit, Part, SteadyState
