@@ -283,7 +283,8 @@ class Curve:
             rest = f"{rest}, per_run=True" if p.per_run else f"given=True, {rest}"
             pars.append(f'    {p.name}=mi.P({p.value:.9g}, "{p.unit}", {rest}),')
         known = [f"    Nearest closed form{' of the first part' * (len(self.parts) > 1)}: {text} (misses "
-                 f"{percent(miss, 2)} of it)." for text, miss in self.nearest()[:1]]
+                 f"{'less than ' * (miss < 1e-3)}{percent(max(miss, 1e-3), 2)} of it)."
+                 for text, miss in self.nearest()[:1]]
         if "encoder_zero" in self.fit.model.effect_names:
             known.append("    To add with mi.effects.encoder_zero: the angle has another zero in every run.")
         if load := next((part.span.load for part in self.parts if part.form.on in COUPLED), ""):
@@ -300,15 +301,14 @@ class Curve:
         """Return closed forms beside the first part, the nearest first: in words with its size, the share missed."""
         if (part := self.parts[0]).by_run:
             return []
-        z, value = self.points
+        (z, value), places = self.points, next(self._apart(self.values))[2]
         forms, unit = _closed_forms(part.form.on, z), part.unit(self.fit)
         if part.form.swings:
-            places = zip(next(self._apart(self.values))[2], part.places, strict=True)
-            rates = [w for w, (*_, kind) in places if kind == "rad/s"] or part.span.rates[part.form.swings]
+            kinds = zip(places, part.places, strict=True)
+            rates = [w for w, (*_, kind) in kinds if kind == "rad/s"] or part.span.rates[part.form.swings]
             forms = [(f"a wave of {number(w / 2 / np.pi, 3)} Hz", [np.sin(w * z), np.cos(w * z)]) for w in rates]
         if part.form.on in PAST:
-            functions = [*part.placed(next(self._apart(self.values))[2]),
-                         *free_forms.functions_of(part.form, part.span)]
+            functions = [*part.placed(places), *free_forms.functions_of(part.form, part.span)]
             lags = np.concatenate([free_forms.values_of(functions, part.form, s) for s in self._signals])
             base, also = ("a constant and ", [-1]) if part.form.carrier else ("", [])  # the last is a constant
             known = _remembering(functions, part.place[0])

@@ -1734,6 +1734,8 @@ def test_what_swings_by_itself_has_another_phase_in_every_run(effect, what, rate
     assert found.remainder.as_effect().doc == f"What is left: {text}."
     hertz = float(found.remainder.nearest()[0][0].split()[3])
     assert 2 * np.pi * hertz == pytest.approx(rate, rel=0.01)
+    if effect is not switched:
+        assert "misses less than 0.1 % of it" in found.remainder.code()
     (tmp_path / "own.py").write_text(found.remainder.code(), encoding="utf-8")
     again = mi.fit(found.remainder.model + own_effects(tmp_path / "own.py")["remainder"], runs[:3])
     assert next(iter(again.per_run))
