@@ -44,11 +44,11 @@ def speed_delay(m: Equations,
 @effect(balance="sensor")
 def speed_average(m: Equations, T_a=P(5e-3, "s", null=0.0, positive=True, grid=(2.0, 6.0, 20.0), pole=True,
                                       doc="window of mean")):
-    """Averaging of the speed over a window (counts), Padé of orders 4 and 5. Golub & Van Loan, 2013, sec. 9.3.
+    """Averaging of the speed over a window (counts), Padé of orders 2 and 3. Golub & Van Loan, 2013, sec. 9.3.
 
     Seen as straight flanks that come late after reversals."""
-    # (1 − e⁻ˣ)/x = (30240 + 840x² + 2x⁴)/(30240 + 15120x + 3360x² + 420x³ + 30x⁴ + x⁵) at x = Ts, exact up to x⁹.
-    _filter(m, "omega", "mean", T_a, (30240, 15120, 3360, 420, 30), (0, 1 / 36, 0, 1 / 15120))
+    # (1 − e⁻ˣ)/x = (120 + 2x²)/(120 + 60x + 12x² + x³) at x = Ts, exact up to x⁵.
+    _filter(m, "omega", "mean", T_a, (120, 60, 12), (0, 1 / 60))
 
 
 @effect(balance="sensor")
