@@ -288,7 +288,7 @@ def functions_of(form: Form, span: Span) -> list[str]:
         return found
     found = (_along if form.on in ("theta", "t", "distance") else _of_size)(form, span, low, high)
     if form.swings:
-        return [f for f in found if "ca.sin(" in f]
+        return [f for f in found if "ca.sin(" in f] or ["0.0"]  # where none stands out
     if form.carrier != "acceleration" and not form.channel == form.on in span.unscaled:
         return found
     middle = f"{0.5 * max(low, high, key=abs) if form.on in ('i', 'omega') else 0.5 * (low + high):.9g}"
@@ -339,7 +339,7 @@ def _along(form: Form, span: Span, low: float, high: float) -> list[str]:
     rates = [k * w for w in rates[:1] for k in range(1, OVERTONES + 1)] if form.swings else rates
     sudden += [f"ca.sin({_place(w, w - reach, w + reach, unit)} * z + {_place(phase, -4, 4, 'rad:phase')})"
                for w in rates for phase in (0, np.pi / 2)]  # what swings, or repeats, by itself
-    wave = f"ca.sin({_place(rates[0], 0.9 * rates[0], 1.1 * rates[0], unit)} * z" if form.swings else ""
+    wave = f"ca.sin({_place(rates[0], 0.9 * rates[0], 1.1 * rates[0], unit)} * z" if form.swings and rates else ""
     sudden += [f"ca.tanh({SUDDEN} * ({wave} + {_place(phase, phase - 1, phase + 1, 'rad:phase')})"
                f" - {_place(level, -0.99, 0.99, '1:level')}))" for phase in np.arange(8) * np.pi / 4
                for level in (-0.7, 0.0, 0.7) if wave and span.finer > 1]  # what is switched on and off

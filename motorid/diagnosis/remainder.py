@@ -20,7 +20,7 @@ import numpy as np
 
 from motorid.channels import COMPUTED_INPUTS, worded
 from motorid.diagnosis import free_forms, misspecification
-from motorid.diagnosis.free_forms import COUPLED, FINER, LOADS, PAST, PLACE, WHERE, Form, Span, load_of
+from motorid.diagnosis.free_forms import COUPLED, FINER, LOADS, PAST, PLACE, WHERE, Form, Span, load_of, swinging
 from motorid.diagnosis.misspecification import FormGain, better_forms, chosen_functions, pitches_of, tells_the_zero
 from motorid.diagnosis.model_comparison import Node, at_noise, far
 from motorid.diagnosis.predictive_score import QUICK, Evidence, HeldOut, Predictions, compare
@@ -824,8 +824,8 @@ def _name(fit: Fit) -> str:
 
 def _growing(curve: Curve, form: Form, moved: bool, before: Predictions, held: HeldOut) -> Iterator[Grown]:
     """Yield a curve with a form more, of ever more functions, as long as these help."""
-    best, led = float("-inf"), None
-    if form.on in COUPLED and not load_of(curve.fit.problem.system):
+    best, led, last = float("-inf"), None, curve.fitted or curve.fit
+    if (form.on in COUPLED and not load_of(last.problem.system)) or (form.swings and not swinging(last, [form])):
         return
     with contextlib.suppress(*FAILURES):
         for begun in dict.fromkeys((curve.begun.first or curve.begun, curve.begun)) if moved and curve.begun else ():
@@ -834,7 +834,7 @@ def _growing(curve: Curve, form: Form, moved: bool, before: Predictions, held: H
             led = replace(begun, fit=curve.fit, name=curve.name, first=None).refitted(curve.fit, there)
             if led and led.fitted and at_noise(Node(led.fitted, None, held.predictions(led.fitted))):
                 break
-        curve = replace(curve, parts=(*curve.parts, Part.of(curve.fitted or curve.fit, form, moved)))
+        curve = replace(curve, parts=(*curve.parts, Part.of(last, form, moved)))
         for _ in range(FEW if moved else ROUNDS):
             check_time()
             known = curve.fitted or curve.fit, curve.fit, curve.values, curve.name, curve.trial, form, moved

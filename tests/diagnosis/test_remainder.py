@@ -1742,5 +1742,10 @@ def test_what_swings_by_itself_has_another_phase_in_every_run(effect, what, rate
     for fit in (found.remainder.fitted, again):
         left = mi.evaluate(fit, runs[3]).rmse
         assert all(left[c] < most * NOISE[c] for c in left), left
+    swing = replace(next(f for f in free_forms.FORMS if (f.balance, f.on) == ("torque", "t")), zeroed=True)
+    assert free_forms.swinging(found.remainder.fit, [swing]) == ([] if effect is switched else [swing])
+    if effect is not switched:
+        assert free_forms.swinging(again, free_forms.FORMS) == []  # nothing stands out any more
+        assert free_forms.force_of(again, swing) == 0
     own = again.per_run["remainder_phase"]
     assert [own[r.name]["value"] % (2 * np.pi) for r in runs[1:3]] == pytest.approx([1.7, 4.2], abs=0.3)
