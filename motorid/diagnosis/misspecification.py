@@ -51,9 +51,9 @@ def better_forms(fit: Fit, rival: Fit, channels: Container[str] = CHANNELS) -> l
     try:
         linear = free_forms.linearised(fit)
         answers = {form: Answers(fit, linear, form).predictions() for form in linear.forms}
-        asked = [f for f in answers if f.on == "turn"] if far(fit) and free_forms.may_be_zeroed(fit) else []
-        asked += free_forms.swinging(fit, answers) if far(fit) else []
-        for form in asked:
+        zeroed = [f for f in answers if f.on == "turn"] if far(fit) and free_forms.may_be_zeroed(fit) else []
+        zeroed += free_forms.swinging(fit, answers) if far(fit) else []
+        for form in zeroed:
             plain, own = answers[replace(form, zeroed=False)], free_forms.zeroed(fit, linear, form)
             known = Answers(fit, own, form).predictions()
             if plain and known and compare(plain, known).sure:  # one curve, shifted, is to do it, not its size alone
