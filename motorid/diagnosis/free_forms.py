@@ -499,6 +499,7 @@ def linearised(fit: Fit, only: Form | None = None, span: Span | None = None,
     problem = fit.problem
     residual, jac = _at(problem, fit)
     signals = signals_along(fit)
+    zeros = zeros_of(fit, only) if only and only.swings and zeros is None else zeros
     if only and zeros:
         firsts = problem.unknowns.firsts
         signals = [{**s, only.on: s[only.on] + zeros.get(f"z_0[{k}]", 0.0)}
@@ -653,7 +654,7 @@ def zeros_of(fit: Fit, form: Form) -> dict[str, float]:
     span = span_of(fit, signals)
     own = form_coefficients(fit, zeroed(fit, linearised(fit), form), form).reshape(len(runs), -1)
     if form.swings:
-        zeros = [float(phase) / span.rates[form.swings][0] for phase in np.angle(own[:, 0] + 1j * own[:, 1])]
+        zeros = [float(a) / (span.rates[form.swings] or [1.0])[0] for a in np.angle(own[:, 0] + 1j * own[:, :2][:, -1])]
         return {f"z_0[{k}]": zero - zeros[0] for k, zero in zip(runs, zeros, strict=True) if k}
     most, angle = int(np.argmax(_travels(fit, signals))), np.linspace(-np.pi, np.pi, 720, endpoint=False)
     waves = values_of(functions_of(form, span), form, {"turn": angle, "t": angle})

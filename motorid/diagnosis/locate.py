@@ -184,7 +184,7 @@ def accounted(before: Fit, after: Fit) -> tuple[tuple[Array, ...], tuple[Array, 
 def _rates(fit: Fit, k: int, states: Mapping[str, Array]) -> dict[str, Array]:
     system, run = fit.problem.system, fit.problem.runs[k]
     x = np.vstack([states.get(n, np.zeros(run.experiment.n)) for n in system.states])
-    f = np.asarray(system.rhs(x, run.grid.u.T, np.array([fit.values[n] for n in system.parameters])))
+    f = np.asarray(system.rhs(x, run.grid.u.T, parameter_vector(fit, k)))
     return {n: f[j] for j, n in enumerate(system.states) if n != "i" or system.stored[j]}
 
 

@@ -94,9 +94,7 @@ def hum_of(fit: Fit, gains: Sequence[FormGain]) -> str:
         return ""
     span = free_forms.span_of(fit, free_forms.signals_along(fit))
     waves = [k for k, f in enumerate(free_forms.functions_of(best.form, span)) if f.startswith("ca.sin(")]
-    zeros = free_forms.zeros_of(fit, best.form) if best.form.swings else None
-    linear = free_forms.linearised(fit, best.form, zeros=zeros)
-    alone = Answers(fit, linear, best.form).predictions(waves) if waves else None
+    alone = Answers(fit, free_forms.linearised(fit, best.form), best.form).predictions(waves) if waves else None
     if alone is None or compare(alone, best.predictions).worth_it:
         return ""
     hertz = number(span.rates[best.form.swings or "t"][0] / 2 / np.pi, 3)

@@ -638,8 +638,7 @@ def _grown_in(there: Fit | None, base: Fit, asked: Sequence[Form]) -> Iterator[t
     """Yield curves, best first, of forms that grew in short windows or are `asked`."""
     if there is not None:
         here, found = HeldOut.of(there, None), dict[Any, Grown]()
-        also = ((Curve(there), f) for f in asked[:AHEAD]
-                if not (f.remembers or f.swings or f.on in ("distance", "run")))
+        also = ((Curve(there), f) for f in asked[:AHEAD] if not f.remembers and f.on not in ("distance", "run"))
         tried = ((replace(curve, trial=True), form) for curve, form in chain(islice(_beyond(there), TRIED), also))
         _race(found, tried, here.predictions(there), here, True)
         for key in sorted(found, key=lambda key: -found[key].gained.gain):

@@ -399,8 +399,7 @@ def _asking_for_all(found: Climb, whole: Fit, held_out: Sequence[Experiment] | N
     looks = [(f, runs, {e.name for e in found.search.effects}) for f in fits if runs]
     longer = versions.samples_of(every) / versions.samples_of(last.problem.experiments)
     if far(last) and not runs and 1 < longer <= versions.WHOLE:
-        tried = (c.effect for some in found.rounds for c in some if c.fit)
-        looks.append((last, every, {name for names in tried for name in names.split(" + ")}))
+        looks.append((last, every, {n for some in found.rounds for c in some if c.fit for n in c.effect.split(" + ")}))
     for fit, records, effects in looks:
         with contextlib.suppress(*FAILURES):
             if at_noise(node_of(versions.fitted_to(fit, records, QUICK), HeldOut.of(whole, held_out))):

@@ -102,7 +102,7 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     """Draw the missing torque or voltage with what was added drawn over it, against the quantity that it acts on.
 
     Dots are samples of what the first model lacks, their mean and its interval of 95 % in bins; the line is what the
-    last model has instead: accepted effects, shifted parameters. What repeats within a turn is drawn over one period.
+    last model has instead: effects, else a known curve, and shifted parameters; what repeats is over one period.
 
     Examples
     --------
@@ -111,7 +111,10 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     style.refuse_other(found, Diagnosis, "plot_answer takes a diagnosis, mi.diagnose(fit)")
     m = found.missing
     balance = "voltage" if found.where == "electrical" and any(map(np.any, m.voltage)) else "torque"  # also for both
-    had = accounted(found.before, found.after)[balance == "torque"] if found.after is not found.before else None
+    left, before = None if found.effects else found.remainder, found.before
+    after = left.fitted if left and left.errors else found.after
+    alike = after is not before and len(after.problem.experiments) == len(before.problem.experiments)
+    had = accounted(before, after)[balance == "torque"] if alike else None
     against, periods = _quantity(found, balance, had)
     x = np.concatenate([np.asarray(s[against]) * periods for s in m.signals])
     x = np.mod(x, 2 * np.pi) if against == "theta" else x
@@ -124,8 +127,8 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     ax.plot(b.centre, b.mean, color=_COLOUR[balance], lw=1.6, label="missing, mean ± 95 %")
     if had is not None:
         b = binned(against, x, np.concatenate(had) * 10.0**-power, bins=FINE)
-        added = " + ".join(n for n in found.after.model.effect_names if n not in found.before.model.effect_names)
-        label = textwrap.fill(f"{added}, with the shift of the parameters", 60)
+        new = " + ".join(n for n in after.model.effect_names if n not in before.model.effect_names)
+        label = textwrap.fill(f"{left.follows if left and left.errors else new}, with the shift of the parameters", 60)
         ax.plot(b.centre, b.mean, "--", color=style.PALETTE["orange"], lw=2.0, label=label)
     ax.axhline(0, color=style.MUTED, lw=0.6)
     unit = "V" if balance == "voltage" else m.torque_unit

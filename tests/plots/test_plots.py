@@ -361,6 +361,18 @@ def test_what_was_added_lies_on_what_was_missing(effect, folder, axis):
     assert np.std(added.get_ydata()) == pytest.approx(np.std(missing.get_ydata()), rel=0.4)
 
 
+def test_a_curve_where_nothing_is_named_lies_on_what_was_missing():
+    runs = mi.read_runs(mi.data_path("hidden_friction") / "run1.csv")
+    found = mi.diagnose(mi.fit(mi.dc_motor(), runs), effects=[])
+    assert (found.verdict, found.effects) == ("unexplained", ())
+    ax = plots.plot_answer(found)
+    assert "speed" in ax.get_xlabel()
+    missing, added = ax.get_lines()[1:3]
+    assert " ".join(added.get_label().split()) == f"{found.remainder.follows}, with the shift of the parameters"
+    assert np.corrcoef(missing.get_ydata(), added.get_ydata())[0, 1] > 0.95
+    assert np.std(added.get_ydata()) == pytest.approx(np.std(missing.get_ydata()), rel=0.4)
+
+
 def test_what_a_driver_lacks_is_drawn_over_its_command():
     """Of a speed alone: over the angle, which passes through each turn, any course was a curve."""
     t, runs, rng = np.arange(0, 8, 5e-3), [], np.random.default_rng(0)
