@@ -102,7 +102,7 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     """Draw the missing torque or voltage with what was added drawn over it, against the quantity that it acts on.
 
     Dots are samples of what the first model lacks, their mean and its interval of 95 % in bins; the line is what the
-    last model has instead: effects, else a known curve, and shifted parameters; what repeats is over one period.
+    last model has instead, effects or, for none, a known curve, and shifted parameters; what repeats: over a period.
 
     Examples
     --------
@@ -111,11 +111,12 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     style.refuse_other(found, Diagnosis, "plot_answer takes a diagnosis, mi.diagnose(fit)")
     m = found.missing
     balance = "voltage" if found.where == "electrical" and any(map(np.any, m.voltage)) else "torque"  # also for both
-    left, before = None if found.effects else found.remainder, found.before
+    left, before = found.remainder if found.after is found.before else None, found.before
     after = left.fitted if left and left.errors else found.after
     alike = after is not before and len(after.problem.experiments) == len(before.problem.experiments)
     had = accounted(before, after)[balance == "torque"] if alike else None
-    against, periods = _quantity(found, balance, had)
+    on = left.form.on.replace("turn", "theta") if left and left.errors and left.form else ""
+    against, periods = (on, 1.0) if on in m.signals[0] else _quantity(found, balance, had)
     x = np.concatenate([np.asarray(s[against]) * periods for s in m.signals])
     x = np.mod(x, 2 * np.pi) if against == "theta" else x
     values = np.concatenate(getattr(m, balance))
@@ -131,8 +132,7 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
         label = textwrap.fill(f"{left.follows if left and left.errors else new}, with the shift of the parameters", 60)
         ax.plot(b.centre, b.mean, "--", color=style.PALETTE["orange"], lw=2.0, label=label)
     ax.axhline(0, color=style.MUTED, lw=0.6)
-    unit = "V" if balance == "voltage" else m.torque_unit
-    noun = "force" if unit == "N" else balance
+    noun = "force" if (unit := "V" if balance == "voltage" else m.torque_unit) == "N" else balance
     name = f"phase of {periods:g} periods per turn (rad)" if periods != 1 else style.axis_label(against)
     ax.set(xlabel=name, ylabel=style.scaled_title(f"missing {noun}", unit, power), title=f"The missing {noun}")
     ax.legend(loc="upper left", bbox_to_anchor=(0.0, -0.16), borderaxespad=0.0)  # below, where it covers no curve
