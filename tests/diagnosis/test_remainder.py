@@ -706,7 +706,7 @@ def test_where_imitations_leave_noise_alone_the_curve_is_of_the_first_model(lab,
 
     def left(*grades: str) -> Remainder:
         found = SimpleNamespace(search=search, path=(search.root, node_of(near, held)), forms=(), stopped="",
-                                grades=[Grade("compliance", g) for g in grades], remaining=Mock(adequate=True))
+                                grades=[Grade("compliance", g) for g in grades], remaining=Mock(adequate=True, hum=""))
         remaining, left = diagnose._left(found, "named" in grades, bool(grades), runs[:2], 60.0)
         assert remaining is found.remaining  # of the last model, which leaves noise, not of the first
         return left
