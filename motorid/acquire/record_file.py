@@ -1,5 +1,4 @@
-"""From wrapped counters to a continuous record, and the record on disk: a CSV file that only ever grows by whole lines,
-and never over something else."""
+"""From wrapped counters to a continuous record, on disk a CSV file that grows by whole lines, never over another."""
 
 import errno
 import math

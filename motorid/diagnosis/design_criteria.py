@@ -380,8 +380,7 @@ class Value(NamedTuple):
 def separation(truth: Driven, rival: Driven, levels: Array, ra: Response, rb: Response, slopes: bool,
                region: float = REGION) -> Value:
     """Return the χ² that a rival leaves, once fitted to old and new records, where another model is the truth: the
-    least favourable one within `region` standard deviations of its values. `ra` and `rb` are the answers at the values
-    of the old records, with slopes by parameter."""
+    worst within `region` deviations. `ra`, `rb`: the answers at the old records' values, with slopes by parameter."""
     k, both = len(truth.rival.scale), (truth, rival)
     prior = np.zeros((2, k + len(rival.rival.scale), k + len(rival.rival.scale)))
     prior[0, :k, :k], prior[1, k:, k:] = truth.rival.known, rival.rival.known

@@ -68,7 +68,7 @@ CHANGES = {"t": "changes with the time", "distance": "changes with the distance 
            "since_reversal": "depends on the time since the voltage was reversed"}
 PAST = (*(on for on in CHANGES if on.startswith("past ")), "path")
 MEMORIES = 8  # lengths of memory
-SWINGS, OVERTONES = 4, 5  # at least in a record (what is slower is a drift), and at most in a swing
+SWINGS, OVERTONES, PADDED = 4, 5, 4  # periods a record (what is slower drifts); waves of a swing; times its length
 TRIPS = (0.02, 0.05, 0.1, 0.2, 0.4)  # of the largest heat: where a fuse or a derating sets in
 PLAY = (0.01, 0.4)  # of the largest value: half of the least and of the largest play
 DAMPED = 0.1  # share of the critical damping with which what swings begins
@@ -161,6 +161,10 @@ class Span:
     unscaled: tuple[str, ...] = ()  # channels the gain of whose sensor the motor's own parameters make up
     load: str = ""  # of `LOADS`
 
+    def rate(self, form: Form) -> float:
+        """Rate of the strongest wave of what swings, rad/s; 1 of all else."""
+        return next(iter(self.rates.get(form.swings, ())), 1.0)
+
 
 def span_of(fit: Fit, signals: Sequence[Mapping[str, Array]]) -> Span:
     """Return the extremes of every quantity known in all runs, and orders of a turn: low, the model's, the misfit's."""
@@ -195,11 +199,11 @@ def load_of(system: System) -> str:
 
 def _rates(fit: Fit, along: Sequence[Array], step: float, least: int = 0, shares: bool = False) -> list[float]:
     """Return the rates of lines over a quantity that stand out of the spectrum of the misfit, or of its shares of what
-    is simulated, the strongest first; of those from the `least` on with less to spare: each is fitted."""
+    is simulated, the strongest first; those of at `least` so many periods by less: each has to prove itself."""
     from scipy.ndimage import median_filter  # slow to import, and not needed before
 
-    finer, chance = (FINER, 1.0) if least else (1, 2.0)
-    length = finer << int(max(np.ptp(z) for z in along) / step + 1).bit_length()
+    finer, chance, longest = *((PADDED, 1.0) if least else (1, 2.0)), max(float(np.ptp(z)) for z in along)
+    length = finer << int(longest / step + 1).bit_length()
     power = np.zeros(length // 2 + 1)
     for run, sim, z in zip(fit.problem.runs, fit.simulations, along, strict=True):
         even = z.min() + step * np.arange(max(np.ptp(z) // step, 1))
@@ -210,7 +214,7 @@ def _rates(fit: Fit, along: Sequence[Array], step: float, least: int = 0, shares
             error = np.interp(even, z[rows], each[rows]) / sigma
             power += np.abs(np.fft.rfft((error - error.mean()) * np.hanning(len(even)), length)) ** 2
     around = np.log(2) * power / np.maximum(median_filter(power, AROUND * finer), 1e-300)  # of noise, 1 in the mean
-    around[: least * finer or KNOTS + 2] = 0.0  # cosines over the range do that
+    around[: round(least * length * step / longest) or KNOTS + 2] = 0.0  # cosines over the range do that
     top = (around[1:-1] >= around[:-2]) & (around[1:-1] >= around[2:]) & (around[1:-1] > chance * np.log(length))
     return [float(2 * np.pi * k / (length * step)) for k in sorted(1 + np.flatnonzero(top), key=lambda k: -power[k])]
 
@@ -260,6 +264,8 @@ def functions_of(form: Form, span: Span) -> list[str]:
     low, high = span.ranges[form.on]
     if form.on == "run":
         return ["1.0"]
+    if form.swings:
+        return _swung(span.rate(form), span) if span.rates[form.swings] else ["0.0"]
     if form.on == "turn":
         waves = ["1.0", *(f"ca.{f}({k:.6g} * z)" for k in waves_of(span) for f in ("sin", "cos"))]
         plain = form.carrier == "acceleration" or span.finer == 1  # none jumps, and forms compare better by few
@@ -287,8 +293,6 @@ def functions_of(form: Form, span: Span) -> list[str]:
                 found += [f"({sign}z > 0) * ca.exp(-ca.fabs(z) / {fade})" for fade in fades]
         return found
     found = (_along if form.on in ("theta", "t", "distance") else _of_size)(form, span, low, high)
-    if form.swings:
-        return [f for f in found if "ca.sin(" in f] or ["0.0"]  # where none stands out
     if form.carrier != "acceleration" and not form.channel == form.on in span.unscaled:
         return found
     middle = f"{0.5 * max(low, high, key=abs) if form.on in ('i', 'omega') else 0.5 * (low + high):.9g}"
@@ -335,18 +339,26 @@ def _along(form: Form, span: Span, low: float, high: float) -> list[str]:
     top = f"{max(abs(low), abs(high)):.6g}"  # a slope, a spring that hardens, a stop, a slack, a ramp
     sudden += [*(f"(z / {top})**{k}" for k in (1, 2, 3)), *(f"ca.fmax((z - {c}) / {top}, 0)" for c in centres)]
     unit, reach = "rad/s" if form.on == "t" else "1:wave", 2 * np.pi / (high - low)
-    rates = span.rates.get(form.swings or form.on, ())
-    rates = [k * w for w in rates[:1] for k in range(1, OVERTONES + 1)] if form.swings else rates
-    sudden += [f"ca.sin({_place(w, w - reach, w + reach, unit)} * z + {_place(phase, -4, 4, 'rad:phase')})"
-               for w in rates for phase in (0, np.pi / 2)]  # what swings, or repeats, by itself
-    wave = f"ca.sin({_place(rates[0], 0.9 * rates[0], 1.1 * rates[0], unit)} * z" if form.swings and rates else ""
-    sudden += [f"ca.tanh({SUDDEN} * ({wave} + {_place(phase, phase - 1, phase + 1, 'rad:phase')})"
-               f" - {_place(level, -0.99, 0.99, '1:level')}))" for phase in np.arange(8) * np.pi / 4
-               for level in (-0.7, 0.0, 0.7) if wave and span.finer > 1]  # what is switched on and off
+    sudden += [_wave(w, reach, phase, 4, unit) for w in span.rates.get(form.on, ()) for phase in (0, np.pi / 2)]
     if form.on != "theta":  # what warms up, or runs in
         whole = high - low
         sudden += [f"ca.exp(-z / {_place(whole / k, whole / 300, whole * 10)})" for k in FADES]
     return ["1.0", *(f"ca.cos({k} * {scale})" for k in range(1, (1 + (form.on == "theta")) * KNOTS)), *sudden]
+
+
+def _wave(rate: float, reach: float, phase: float, around: float, unit: str = "rad/s") -> str:
+    """Return what swings, or repeats, by itself, as source; its rate and its phase may be moved by so much."""
+    places = _place(rate, rate - reach, rate + reach, unit), _place(phase, phase - around, phase + around, "rad:phase")
+    return f"ca.sin({places[0]} * z + {places[1]})"
+
+
+def _swung(rate: float, span: Span) -> list[str]:
+    """Return what swings at a rate, with overtones, and what is switched on and off at it, as source."""
+    reach, quarters = 2 * np.pi / float(np.ptp(span.ranges["t"])), np.arange(8) * np.pi / 4
+    waves = [_wave(k * rate, reach, phase, 4) for k in range(1, OVERTONES + 1) for phase in (0, np.pi / 2)]
+    levels = [_place(level, -0.99, 0.99, "1:level") for level in (-0.7, 0.0, 0.7) if span.finer > 1]
+    return waves + [f"ca.tanh({SUDDEN} * ({_wave(rate, 0.1 * rate, phase, 1)} - {level}))"
+                    for phase in quarters for level in levels]
 
 
 def _of_size(form: Form, span: Span, low: float, high: float) -> list[str]:
@@ -499,12 +511,12 @@ def linearised(fit: Fit, only: Form | None = None, span: Span | None = None,
     problem = fit.problem
     residual, jac = _at(problem, fit)
     signals = signals_along(fit)
+    span = span or span_of(fit, signals)
     zeros = zeros_of(fit, only) if only and only.swings and zeros is None else zeros
     if only and zeros:
         firsts = problem.unknowns.firsts
-        signals = [{**s, only.on: s[only.on] + zeros.get(f"z_0[{k}]", 0.0)}
+        signals = [{**s, only.on: s[only.on] + zeros.get(f"z_0[{k}]", 0.0) / span.rate(only)}
                    for s, k in zip(signals, firsts, strict=True)]
-    span = span or span_of(fit, signals)
     forms = [f for f in FORMS if shown(f, fit, span.ranges)] if only is None else [only]
     free, n, runs = len(problem.model.free_names), problem.n_outputs, range(len(signals))
     seen = [replace(a, b=_with_load(fit, k, a), c=a.c * m.weights[:, None])
@@ -648,14 +660,14 @@ def zeroed(fit: Fit, linear: Linear, form: Form) -> Linear:
 
 
 def zeros_of(fit: Fit, form: Form) -> dict[str, float]:
-    """Return the zero of the angle or the time in every record but the first, by name: where its curve is most like the
-    longest, or where its strongest wave has the phase of the first."""
+    """Return the zero of the angle in every record but the first, by name, rad: where its curve is most like the
+    longest; of what swings, how far its strongest wave is ahead of the first one's."""
     signals, runs = signals_along(fit), sorted(set(fit.problem.unknowns.firsts))
     span = span_of(fit, signals)
     own = form_coefficients(fit, zeroed(fit, linearised(fit), form), form).reshape(len(runs), -1)
     if form.swings:
-        zeros = [float(a) / (span.rates[form.swings] or [1.0])[0] for a in np.angle(own[:, 0] + 1j * own[:, :2][:, -1])]
-        return {f"z_0[{k}]": zero - zeros[0] for k, zero in zip(runs, zeros, strict=True) if k}
+        phases = np.angle(own[:, 0] + 1j * own[:, :2][:, -1]).tolist()
+        return {f"z_0[{k}]": phase - phases[0] for k, phase in zip(runs, phases, strict=True) if k}
     most, angle = int(np.argmax(_travels(fit, signals))), np.linspace(-np.pi, np.pi, 720, endpoint=False)
     waves = values_of(functions_of(form, span), form, {"turn": angle, "t": angle})
     curves = waves[:, 1:] @ own[:, 1:].T  # without the constant

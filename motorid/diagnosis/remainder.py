@@ -183,7 +183,7 @@ class Part:
         form, terms, own = self.form, self.terms(places), names[0]
         state, begins, rate = STATES.get(form.on, ("", "", ""))
         step = f"{self.span.step / (INPUT_AT_ONCE if form.on == 'past v' else AT_ONCE):.6g}"
-        begun = f" + {phase} / {self.span.rates[form.swings][0]:.9g}" if form.swings else ""
+        begun = f" + {phase} / {self.span.rate(form):.9g}" if form.swings else ""
         lines = [f"z = {state or QUANTITIES[form.on].format(load=self.span.load)}{begun}"]
         if state and form.on not in known:
             lines = [f"{state} = m.state('{own}_{state}', {begins})",
@@ -305,7 +305,7 @@ class Curve:
         forms, unit = _closed_forms(part.form.on, z), part.unit(self.fit)
         if part.form.swings:
             kinds = zip(places, part.places, strict=True)
-            rates = [w for w, (*_, kind) in kinds if kind == "rad/s"] or part.span.rates[part.form.swings]
+            rates = [w for w, (*_, kind) in kinds if kind == "rad/s"] or [part.span.rate(part.form)]
             forms = [(f"a wave of {number(w / 2 / np.pi, 3)} Hz", [np.sin(w * z), np.cos(w * z)]) for w in rates]
         if part.form.on in PAST:
             functions = [*part.placed(places), *free_forms.functions_of(part.form, part.span)]
@@ -333,8 +333,9 @@ class Curve:
 
     @cached_property
     def _signals(self) -> list[dict[str, Array]]:
-        each, zeros = free_forms.signals_along(self.fit), self._zeros  # of whole runs
-        return [{**s, "t": s["t"] + zeros.get(f"z_0[{k}]", 0.0)} for k, s in enumerate(each)]
+        each, (form, span) = free_forms.signals_along(self.fit), (self.parts[0].form, self.parts[0].span)
+        ahead = self._zeros if form.swings else {}  # of whole runs
+        return [{**s, "t": s["t"] + ahead.get(f"z_0[{k}]", 0.0) / span.rate(form)} for k, s in enumerate(each)]
 
     def grown(self) -> "Curve | None":
         """Return the curve with functions of its last part that predict more, fitted, or None; raises as a fit."""
@@ -358,16 +359,14 @@ class Curve:
         first = self.values[: len(self.values) - len(part.chosen) - len(part.places)]
         curve, without = (replace(self, parts=(*before, larger), values=(*first, *sizes, *new, *places))
                           for new in (free, [0.0] * len(more)))
-        rate, own = part.span.rates.get(part.form.swings, [1.0])[0], f"{self.name}_phase"
-        phases = {n.replace("z_0", own): zero * rate for n, zero in zeros.items()}
+        phases = {n.replace("z_0", f"{self.name}_phase"): phase for n, phase in zeros.items()}
         return curve.refitted(last, curve.sizes | phases, without.sizes | phases)
 
     @property
     def _zeros(self) -> dict[str, float]:
-        """The zero of the time in every run but the first, as fitted."""
-        fitted = self.fitted.initial if self.fitted else {}
-        rate = next((part.span.rates[part.form.swings][0] for part in self.parts if part.form.swings), 1.0)
-        return {n.replace(own, "z_0"): z / rate for n, z in fitted.items() if n.startswith(own := f"{self.name}_phase")}
+        """How far what swings is ahead of the first run's in every other, as fitted, rad."""
+        fitted, own = self.fitted.initial if self.fitted else {}, f"{self.name}_phase"
+        return {n.replace(own, "z_0"): phase for n, phase in fitted.items() if n.startswith(own)}
 
     def without(self, k: int) -> "Curve | None":
         """Return the curve without a part, fitted anew; None where that fails."""
@@ -388,8 +387,7 @@ class Curve:
         return slim.refitted(self.fitted or self.fit, slim.sizes) if len(values) < len(self.values) else None
 
     def refitted(self, last: Fit, *starts: Mapping[str, float]) -> "Curve | None":
-        """Return the curve fitted with the model, from `starts` beside the `last` values or not; None if that fails, or
-        only tells the measured angle to follow itself."""
+        """Return the curve fitted from `starts`, with and without the `last` values; None where it copies the angle."""
         model, every = self.fit.model + self.effect, [{**w, **s} for s in starts for w in (last.values, {})]
         key = last, self.fit, self.law, *(tuple(start.items()) for start in every)
         if (done := _once(lambda: refit(last, model, every), *key)) is None or copies_the_angle(done.problem, done.q):
@@ -568,8 +566,7 @@ class Remainder:
 
     @property
     def _anew(self) -> tuple[Fit, ...]:
-        """The model that the search began with, where the last is far from noise: all found may imitate one. Where
-        zeros of the angle are among that, it with these, too."""
+        """The first model, and it with the angle's zeros if these were found, where the last one is far from noise."""
         if self._root is None or self._root is self.fit or not far(self.fit):
             return ()
         added = {e.name: e for e in self.fit.model.effects if e.name not in self._root.model.effect_names}

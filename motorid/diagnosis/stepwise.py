@@ -323,8 +323,8 @@ def _looks(fit: Fit, held_out: Sequence[Experiment] | None, climbed: Callable[..
     seconds = left()
     as_it_was, records, found = _read_and_climbed(versions.affordable(fit), held_out, climbed)
     yield found, records
-    time = seconds is None or (left() or 0.0) > 2 * seconds / 3
-    if among := time and look(_asking_for_all, found, fit, held_out):
+    early = seconds is None or (left() or 0.0) > 2 * seconds / 3
+    if among := early and look(_asking_for_all, found, fit, held_out):
         *whole, anew = _read_and_climbed(fit, held_out, partial(climbed, among=among))
         found = replace(found, stopped=anew.stopped) if anew.stopped else anew
         as_it_was, records = whole if found is anew else (as_it_was, records)

@@ -211,8 +211,7 @@ def errors_text(rungs: Sequence[Rung]) -> str:
 
 
 def curve_text(rungs: Sequence[Rung], errors: Mapping[str, float], forms: Sequence[tuple[str, float]]) -> str:
-    """Say what the `errors` become with what is left as a curve, and which of the closed `forms`, the nearest first, it
-    is but for a trifle; empty where none is known."""
+    """Say what the `errors` become with a curve, and which of the closed `forms`, the nearest first, it all but is."""
     was = moving(rungs[0].validation_nrmse or rungs[0].nrmse)
     said = ", ".join(_changed(c, e, errors[c]) for c, e in was.items() if c in errors)
     near = "".join(f" The nearest closed form, {text}, misses {'less than ' * (miss < 1e-3)}"

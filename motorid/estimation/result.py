@@ -127,8 +127,7 @@ class Fit(Shown):
     def std(self) -> dict[str, float | None]:
         """One standard deviation per parameter, in its unit: 0 where fixed, None where the data do not determine it.
 
-        For coloured residuals: those of a model that lacks something go with the motion, and taken as white noise
-        they would make its parameters far too certain."""
+        For coloured residuals: taken as white noise, those of a model that lacks something make it far too certain."""
         known = dict(zip((p.name for p in self.problem.unknown), self._certainty.std, strict=True))
         return {n: known.get(n, 0.0) for n in self.values}
 

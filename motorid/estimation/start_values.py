@@ -3,8 +3,7 @@
 The first guess, of the motor and the loads on it, comes from the data alone. The balances are integrated over time, so
 nothing is differentiated, and solved as non-negative linear least squares: ``∫v dt = L Δi + R ∫i dt + K ∫ω dt`` and
 ``K ∫i dt = J Δω + b ∫ω dt`` (Garnier & Wang, Identification of Continuous-time Models from Sampled Data, 2008, ch. 1).
-A current or a speed that was not measured is eliminated; what no record tells is taken as given, or round. Torques of
-the model's effects are further columns."""
+A current or a speed that was not measured is eliminated; what none tells is given, or round; effects add columns."""
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations

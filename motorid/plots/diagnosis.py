@@ -32,8 +32,7 @@ _COLOUR = {"voltage": style.PALETTE["purple"], "torque": style.PALETTE["blue"]}
 def plot_missing(result: Missing | Diagnosis, *, show: int = 3, run: int | None = None) -> np.ndarray:
     """Draw the missing voltage and torque over time, and against what explains them best.
 
-    Dots are samples, the line with its band the mean and its interval of 95 % in bins. The title of each
-    panel says which share of the variance that quantity explains.
+    Dots are samples, lines means in bins with their 95 %; titles say which share of the variance a quantity explains.
 
     Parameters
     ----------
@@ -111,11 +110,11 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     style.refuse_other(found, Diagnosis, "plot_answer takes a diagnosis, mi.diagnose(fit)")
     m = found.missing
     balance = "voltage" if found.where == "electrical" and any(map(np.any, m.voltage)) else "torque"  # also for both
-    left, before = found.remainder if found.after is found.before else None, found.before
-    after = left.fitted if left and left.errors else found.after
-    alike = after is not before and len(after.problem.experiments) == len(before.problem.experiments)
-    had = accounted(before, after)[balance == "torque"] if alike else None
-    on = left.form.on.replace("turn", "theta") if left and left.errors and left.form else ""
+    left = found.remainder if found.after is found.before and found.remainder and found.remainder.errors else None
+    after = left.fitted if left else found.after
+    alike = after is not found.before and len(after.problem.experiments) == len(found.before.problem.experiments)
+    had = accounted(found.before, after)[balance == "torque"] if alike else None
+    on = left.form.on.replace("turn", "theta") if left and left.form else ""
     against, periods = (on, 1.0) if on in m.signals[0] else _quantity(found, balance, had)
     x = np.concatenate([np.asarray(s[against]) * periods for s in m.signals])
     x = np.mod(x, 2 * np.pi) if against == "theta" else x
@@ -128,8 +127,8 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
     ax.plot(b.centre, b.mean, color=_COLOUR[balance], lw=1.6, label="missing, mean ± 95 %")
     if had is not None:
         b = binned(against, x, np.concatenate(had) * 10.0**-power, bins=FINE)
-        new = " + ".join(n for n in after.model.effect_names if n not in before.model.effect_names)
-        label = textwrap.fill(f"{left.follows if left and left.errors else new}, with the shift of the parameters", 60)
+        new = " + ".join(n for n in after.model.effect_names if n not in found.before.model.effect_names)
+        label = textwrap.fill(f"{left.follows if left else new}, with the shift of the parameters", 60)
         ax.plot(b.centre, b.mean, "--", color=style.PALETTE["orange"], lw=2.0, label=label)
     ax.axhline(0, color=style.MUTED, lw=0.6)
     noun = "force" if (unit := "V" if balance == "voltage" else m.torque_unit) == "N" else balance
@@ -281,8 +280,7 @@ def plot_design(design: Design) -> np.ndarray:
 def plot_residuals(fit: Fit, channels: Sequence[str] | None = None) -> np.ndarray:
     """Draw the residuals of each channel: over time, histogram, correlations, and against the model's ω, i, θ.
 
-    Noise alone is flat: a histogram under the curve of the normal distribution, correlations within
-    their bands of 95 %, means of zero against every quantity.
+    Noise alone is flat: a histogram under the normal curve, correlations within their bands of 95 %, means of zero.
 
     Parameters
     ----------

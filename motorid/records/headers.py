@@ -1,4 +1,4 @@
-"""Which column is which channel, in which unit: as the user, or the header, says (en, de, fr, es), with every guess."""
+"""Which column is which channel, in which unit: as the user or the header (en, de, fr, es) says; guesses are noted."""
 
 import math
 import re
@@ -87,7 +87,7 @@ def require_unit(text: object, channel: str, pulses: bool = True) -> Unit:
 
 
 def _pulse(text: str) -> Unit | None:
-    """Read the width of a servo's pulse as a command: 1000 to 2000 µs are −1 to 1, 0 may be said (``us:1000``)."""
+    """Read the width of a servo's pulse as a command: 1000 to 2000 µs are −1 to 1; ``us:1000`` says where 0 is."""
     label = text.strip("[](){}<> \t")
     if not (found := re.fullmatch(r"([um])s(?:ec)?(?::(\d+\.?\d*))?", label.translate(_LETTERS).lower())):
         return None

@@ -218,8 +218,7 @@ def _held_out(fit: Fit, validate: Sequence[Experiment]) -> Section:
 
 def _answer(d: Diagnosis) -> Section:
     """What was found: the missing torque or voltage with what was added, errors before and after, the next step."""
-    added = d.after is not d.before or (d.remainder and d.remainder.errors)
-    caption = f"What the model lacks: dots, mean with 95 %{'; what was added, parameters moved: dashed' * bool(added)}."
+    caption = "What the model lacks: dots, mean with 95 %; dashed, if any: what was added, with the parameters' shift."
     drawn = [] if d.verdict == "adequate" or d.where == "sensor" else [
         _figure("answer", caption, d.answer or d.text, "plot_answer", d, small=True)]
     next_step = [f"Next experiment: {d.suggestion}"] if d.suggestion else []

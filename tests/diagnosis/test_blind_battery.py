@@ -21,8 +21,8 @@ RUN = Path(__file__).parents[1] / "battery" / "blind" / "run.py"
 
 
 LATER = {"current_average", "driver_voltage_limit", "driver_lag", "speed_filter", "driver_slew", "pwm_coast",
-         "pwm_fast_decay",
-         "slip_clutch", "freewheel", "end_stop", "speed_ripple", "driver_one_quadrant", "angle_lag"}  # than these
+         "pwm_fast_decay", "slip_clutch", "freewheel", "end_stop", "speed_ripple", "driver_one_quadrant",
+         "angle_lag"}  # than these
 
 
 def of(battery, kind):

@@ -35,7 +35,7 @@ from motorid.diagnosis.free_forms import (
     span_of,
     values_of,
 )
-from motorid.diagnosis.locate import locate
+from motorid.diagnosis.locate import accounted, locate
 from motorid.diagnosis.misspecification import Grade
 from motorid.diagnosis.model_comparison import node_of
 from motorid.diagnosis.predictive_score import Evidence, HeldOut
@@ -1732,6 +1732,10 @@ def test_what_swings_by_itself_has_another_phase_in_every_run(effect, what, rate
         assert text in found.text
     assert found.effects == ()
     assert found.remainder.as_effect().doc == f"What is left: {text}."
+    if effect is shaken:  # in every run with its own phase
+        torques = accounted(found.before, found.remainder.fitted)[1]
+        for phase, torque in zip((0.3, 2.0, 4.5), torques, strict=True):
+            assert np.corrcoef(torque, -np.sin(14 * t + phase))[0, 1] > 0.85  # the parameters shift, too
     hertz = float(found.remainder.nearest()[0][0].split()[3])
     assert 2 * np.pi * hertz == pytest.approx(rate, rel=0.01)
     if effect is not switched:

@@ -216,8 +216,7 @@ def below_steady(problem: Problem) -> str | None:
 def contradiction(problem: Problem, q: Array) -> str | None:
     """Return a sentence naming the constraints that no values near keep together, and by how much; None if all can be.
 
-    At the least sum of squared violations those that are left push against one another, or against the limits of
-    the parameters; the others have no part in it."""
+    At the least sum of squared violations those left push against one another, or against limits; others do not."""
     found = [_least_violations(problem, start) for start in (q, problem.start)]
     if (at := min((f for f in found if f is not None), key=lambda f: f[0], default=None)) is None or at[0] < MISSED:
         return None
