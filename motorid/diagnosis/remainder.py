@@ -41,6 +41,7 @@ from motorid.numerics.signals import Array
 from motorid.records.experiment import Experiment, units_of
 
 SECONDS = 120.0  # after which the best curve so far is taken
+ENOUGH = 30.0  # for one fit of it, which need not come to an end: then the others have their turn
 TRIED = 4  # curves that are fitted, those that promise most
 FINE = range(1, 37)  # harmonics of a turn in a curve that is fitted
 CLOSED = 300  # times that are tried as the end, or the beginning, of a constant
@@ -823,7 +824,7 @@ def _growing(curve: Curve, form: Form, moved: bool, before: Predictions, held: H
     best, led, last = float("-inf"), None, curve.fitted or curve.fit
     if (form.on in COUPLED and not load_of(last.problem.system)) or (form.swings and not swinging(last, [form])):
         return
-    with contextlib.suppress(*FAILURES):
+    with contextlib.suppress(*FAILURES, OutOfTime):
         for begun in dict.fromkeys((curve.begun.first or curve.begun, curve.begun)) if moved and curve.begun else ():
             there = {n: v for n, v in (begun.fitted or begun.fit).values.items() if n != "sgn_width"}
             # In windows noise is not always reached, and what imitates it grows there.
@@ -834,7 +835,8 @@ def _growing(curve: Curve, form: Form, moved: bool, before: Predictions, held: H
         for _ in range(FEW if moved else ROUNDS):
             check_time()
             known = curve.fitted or curve.fit, curve.fit, curve.values, curve.name, curve.trial, form, moved
-            larger, led = led or _once(curve.grown, *known), None
+            with budget(ENOUGH):
+                larger, led = led or _once(curve.grown, *known), None
             if larger is None or larger.fitted is None:
                 return
             predicted = held.predictions(larger.fitted)
@@ -842,6 +844,7 @@ def _growing(curve: Curve, form: Form, moved: bool, before: Predictions, held: H
                 return
             curve, best = replace(larger, first=curve.first or larger), gained.gain
             yield Grown(gained, predicted, curve)
+    check_time()
 
 
 def _remembering(functions: Sequence[str], usual: str) -> Iterator[tuple[int, str]]:

@@ -1350,6 +1350,26 @@ def test_a_budget_that_is_spent_ends_the_search_for_curves(lab):
         left.as_effect()
 
 
+def test_a_curve_that_does_not_come_to_an_end_makes_room_for_the_others(beyond, lab, monkeypatch):
+    """Beside one that ran away from every sample anew, a load over the angle kept 8 times the noise."""
+    rng, clock, whole = np.random.default_rng(4), [0.0], Curve.grown
+    runs = [record(driven(lab, {"eddy": {"top": 2e-2, "w": 25.0}}, w, 400, 1e-3, rng), "logger", ("i", "omega"), lab,
+                   rng, w) for w in FAST]
+    torque, endless = FORMS_BY_HAND
+
+    def grown(curve):
+        while curve.parts[-1].form == endless:
+            clock[0] += 1.0
+            parallel.check_time()
+        return whole(curve)
+
+    monkeypatch.setattr(parallel, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    monkeypatch.setattr(Curve, "grown", grown)
+    left = Remainder("structure", mi.fit(mi.dc_motor(), runs), (endless, torque))
+    assert "m.torque -=" in left.code()
+    assert clock[0] < 0.9 * remainder.SECONDS
+
+
 def test_a_search_for_curves_has_an_end_of_its_own(beyond, lab, monkeypatch):
     rng = np.random.default_rng(4)
     runs = [record(driven(lab, {"eddy": {"top": 2e-2, "w": 25.0}}, w, 400, 1e-3, rng), "logger", ("i", "omega"), lab,
