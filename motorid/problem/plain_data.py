@@ -91,8 +91,7 @@ def _built(told: Any) -> Any:
 
 
 def model_from_json(contents: Mapping[str, Any], effects: Iterable[Effect] = ()) -> Model:
-    """Return the `Model`, at its values, of what ``fit --json`` or `export` wrote; more in it does no harm. `effects`
-    of the user's own go before the library's of the same name."""
+    """Return the `Model`, at its values, that ``fit --json`` or `export` wrote; `effects` go before the library's."""
     part, values, fixed = "model", {}, {}  # fixed first: what is fixed may be zero, what is free may not
     try:
         head = dict(contents[part])

@@ -66,8 +66,7 @@ def parse_unit(text: str) -> Unit | None:
 
 
 def require_unit(text: object, channel: str, pulses: bool = True) -> Unit:
-    """Read the unit that a user gave for a channel; a number may touch it (0.047V), which in a header is a name.
-    `pulses`: a time may be the width of a servo's pulses."""
+    """Read the unit a user gave; a number may touch it (0.047V, in headers a name), of `pulses` a time be the width."""
     if pulses and channel == "v" and (pulse := _pulse(str(text))) is not None:
         return pulse
     unit = parse_unit(re.sub(r"(?i)^((?>[-+]?[\d.]+(?:e[-+]?\d+)?))(?=[a-z°%µμ])", r"\1 ", str(text)))

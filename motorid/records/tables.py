@@ -1,5 +1,4 @@
-"""A table of numbers from the bytes of a file: of text (encoding, dialect, header, row of units, rows; pandas parses),
-of MATLAB or of Parquet."""
+"""A table of numbers from a file: text (encoding, dialect, headers, rows; pandas parses), MATLAB or Parquet."""
 
 import csv
 import io
