@@ -41,7 +41,7 @@ from motorid.numerics.signals import Array
 from motorid.records.experiment import Experiment, units_of
 
 SECONDS = 120.0  # after which the best curve so far is taken
-ENOUGH = 30.0  # for one fit of it, which need not come to an end: then the others have their turn
+ENOUGH = 30.0  # s, for one fit of it, which need not come to an end: then the others have their turn
 TRIED = 4  # curves that are fitted, those that promise most
 FINE = range(1, 37)  # harmonics of a turn in a curve that is fitted
 CLOSED = 300  # times that are tried as the end, or the beginning, of a constant
@@ -828,7 +828,8 @@ def _growing(curve: Curve, form: Form, moved: bool, before: Predictions, held: H
         for begun in dict.fromkeys((curve.begun.first or curve.begun, curve.begun)) if moved and curve.begun else ():
             there = {n: v for n, v in (begun.fitted or begun.fit).values.items() if n != "sgn_width"}
             # In windows noise is not always reached, and what imitates it grows there.
-            led = replace(begun, fit=curve.fit, name=curve.name, first=None).refitted(curve.fit, there)
+            with budget(ENOUGH):
+                led = replace(begun, fit=curve.fit, name=curve.name, first=None).refitted(curve.fit, there)
             if led and led.fitted and at_noise(Node(led.fitted, None, held.predictions(led.fitted))):
                 break
         curve = replace(curve, parts=(*curve.parts, Part.of(last, form, moved)))

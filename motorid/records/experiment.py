@@ -184,8 +184,7 @@ class Experiment(Shown):
     def delayed(self, seconds: float) -> Experiment:
         """Return the run with a voltage that acts later than its column says, earlier if `seconds` is negative.
 
-        Before the record there was none where the motor begins at rest, else as much as at its beginning; a held one
-        that moves by parts of a sample is averaged over each."""
+        Before the record it is none at rest, else as at its beginning; held, it is averaged over parts of a sample."""
         if not np.isfinite(seconds) or abs(seconds) >= self.duration:
             raise UsageError(f"{self.name}: a voltage can be delayed by less than the {self.duration:.4g} s of the "
                              f"run; got {seconds!r}.")

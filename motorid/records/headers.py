@@ -66,7 +66,7 @@ def parse_unit(text: str) -> Unit | None:
 
 
 def require_unit(text: object, channel: str, pulses: bool = True) -> Unit:
-    """Read the unit a user gave; a number may touch it (0.047V, in headers a name), of `pulses` a time be the width."""
+    """Read the unit that a user gave: a number may touch it (0.047V), and of `pulses` a time is the servo's."""
     if pulses and channel == "v" and (pulse := _pulse(str(text))) is not None:
         return pulse
     unit = parse_unit(re.sub(r"(?i)^((?>[-+]?[\d.]+(?:e[-+]?\d+)?))(?=[a-z°%µμ])", r"\1 ", str(text)))

@@ -1353,21 +1353,28 @@ def test_a_budget_that_is_spent_ends_the_search_for_curves(lab):
 def test_a_curve_that_does_not_come_to_an_end_makes_room_for_the_others(beyond, lab, monkeypatch):
     """Beside one that ran away from every sample anew, a load over the angle kept 8 times the noise."""
     rng, clock, whole = np.random.default_rng(4), [0.0], Curve.grown
-    runs = [record(driven(lab, {"eddy": {"top": 2e-2, "w": 25.0}}, w, 400, 1e-3, rng), "logger", ("i", "omega"), lab,
-                   rng, w) for w in FAST]
+    runs = [record(driven(lab, BRAKE, w, 400, 1e-3, rng), "logger", ("i", "omega"), lab, rng, w) for w in FAST]
     torque, endless = FORMS_BY_HAND
 
-    def grown(curve):
-        while curve.parts[-1].form == endless:
+    def for_ever(*_):
+        while True:
             clock[0] += 1.0
             parallel.check_time()
-        return whole(curve)
+
+    def grown(curve):
+        return for_ever() if curve.parts[-1].form == endless else whole(curve)
 
     monkeypatch.setattr(parallel, "time", SimpleNamespace(monotonic=lambda: clock[0]))
     monkeypatch.setattr(Curve, "grown", grown)
-    left = Remainder("structure", mi.fit(mi.dc_motor(), runs), (endless, torque))
-    assert "m.torque -=" in left.code()
+    fit = mi.fit(mi.dc_motor(), runs)
+    assert "m.torque -=" in Remainder("structure", fit, (endless, torque)).code()
     assert clock[0] < 0.9 * remainder.SECONDS
+    monkeypatch.setattr(Curve, "refitted", for_ever)  # of what grew in short windows
+    held, began = HeldOut.of(fit, None), clock[0]
+    with budget(remainder.SECONDS):
+        begun = Curve(fit, begun=Curve(fit))
+        assert list(remainder._growing(begun, torque, True, held.predictions(fit), held)) == []
+    assert clock[0] - began < 0.5 * remainder.SECONDS
 
 
 def test_a_search_for_curves_has_an_end_of_its_own(beyond, lab, monkeypatch):
