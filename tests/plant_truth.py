@@ -25,6 +25,7 @@ NUMBERS = {  # one plausible size of every effect
     "viscous_asymmetric": {"b_a": 2e-5},
     "lugre": {"sigma_0": 0.5, "sigma_1": 1e-3, "tau_c": 4e-3, "tau_s": 6e-3, "omega_s": 4.0},
     "compliance": {"k_s": 2.0, "c_s": 1e-3, "J_l": 2e-5},
+    "compliance_load_side": {"k_s": 2.0, "c_s": 1e-3, "J_l": 2e-5},
     "backlash": {"gap": 0.03, "k_s": 5.0, "c_s": 2e-3, "J_l": 2e-5},
     "slip_clutch": {"tau_slip": 3e-3, "omega_slip": 0.5, "b_slip": 1e-6, "J_l": 2e-5},
     "freewheel": {"c_g": 0.05, "b_free": 2e-6, "J_l": 2e-5, "side": 1.0},
@@ -86,13 +87,14 @@ def largest(error, reference):
 def in_library_words(name, numbers, motor):
     """Numbers of the plant's effect as the library's parameters, and the total inertia."""
     n, J = dict(numbers), motor.J
-    if name in ("compliance", "backlash"):
+    if name in ("compliance", "compliance_load_side", "backlash"):
         J_l, k_s, c_s = n.pop("J_l"), n.pop("k_s"), n.pop("c_s")
         J = motor.J + J_l
         resonance = np.sqrt(k_s / motor.J + k_s / J_l)
-        shaft = (J_l / J, resonance, c_s * resonance / (2 * k_s))
-        words = ("r_load", "omega_r", "zeta_r") if name == "compliance" else ("r_gap", "omega_c", "zeta_c")
-        n |= dict(zip(words, shaft, strict=True))
+        share, zeta = J_l / J, c_s * resonance / (2 * k_s)
+        n |= {"compliance": {"r_load": share, "omega_r": resonance, "zeta_r": zeta},
+              "compliance_load_side": {"r_far": share, "T_far": 1 / resonance, "zeta_far": zeta},
+              "backlash": {"r_gap": share, "omega_c": resonance, "zeta_c": zeta}}[name]
     if name == "driver_slew":  # so near that it does not matter
         n["V_w"] = 2e-3
     if name in ("slip_clutch", "freewheel"):

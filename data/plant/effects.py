@@ -15,6 +15,7 @@ An effect is a function of the motor and its own numbers that returns what it do
     heat(i, dT) -> K/s        rate of the temperature rise
     part(i, w, th, x) -> (torque, rates)   something with states x of its own, which start at `x0`
     flux(x) -> factor on K in both balances, of the states of the effect's part
+    sensed                    the first two of these states are the speed and the angle that sensors see
     sensor -> (kind, number)  what happens between the shaft and the logger
     rate                      1/s, the fastest rate it adds, for the choice of the integration step
 """
@@ -267,6 +268,12 @@ def compliance(m: Motor, k_s: float, c_s: float, J_l: float) -> Hooks:
         return -twist, (twist / J_l, x[0])
 
     return {"part": part, "x0": lambda w, th: (w, th), "rate": sqrt(k_s / m.J + k_s / J_l)}
+
+
+@_known
+def compliance_load_side(m: Motor, k_s: float, c_s: float, J_l: float) -> Hooks:
+    """The same shaft and load, whose speed and angle are sensed."""
+    return {**compliance(m, k_s, c_s, J_l), "sensed": True}
 
 
 @_known

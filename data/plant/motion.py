@@ -53,7 +53,7 @@ class Plant:
         self._rates, self._level, x0 = _physics(motor, hooks, omega0, theta0)
         self._y = [0.0, float(omega0), float(theta0), 0.0, *x0]  # i, omega, theta, dT, and states of parts
         self._s = (0 if omega0 == 0 else 1 if omega0 > 0 else -1) if self._level else FREE
-        self._sensors = Chain(hooks, omega0)
+        self._sensors, self._sensed = Chain(hooks, omega0), _sensed(hooks)
         self._v, self._coasts = 0.0, any("diodes" in h for h in hooks)
         self._one_way = next((h["diodes"] for h in hooks if "one way" in h), 0.0)
         self._limit = min((h["limit"] for h in hooks if "limit" in h), default=inf)
@@ -95,7 +95,7 @@ class Plant:
             if abs(i) <= self._limit < abs(self._y[0]):
                 self._y[0] = copysign(self._limit, i)  # it is reached within the step
             self.t = t0 + (k + 1) * h
-            self._sensors.sample(self.t, h, self._y[0], self._y[1])
+            self._sensors.sample(self.t, h, self._y[0], self._y[self._sensed])
         return self.measured()
 
     def _carry(self, v: float) -> None:
@@ -120,7 +120,7 @@ class Plant:
 
         With v volts commanded meanwhile, which a sensor before the bridge sees; by default the latest.
         """
-        return self._sensors.read(self.t, self._y, self._v if v is None else v)
+        return self._sensors.read(self.t, self._y[self._sensed + 1], self._v if v is None else v)
 
     def _advance(self, v0: float, v1: float, h: float) -> None:
         if self._s == FREE:
@@ -181,6 +181,16 @@ def _rk4(f: Callable, y: list[float], v0: float, v1: float, h: float, s: int, t:
     r = f(_moved(y, half, q), mid, s, t)
     u = f(_moved(y, h, r), v1, s, t)
     return [a + sixth * (p + 2 * (b + c) + d) for a, p, b, c, d in zip(y, k, q, r, u)]  # noqa: B905  (fast)
+
+
+def _sensed(hooks: list[dict]) -> int:
+    """Which state is the speed that sensors see; their angle is the next."""
+    first = 4
+    for h in hooks:
+        if "sensed" in h:
+            return first
+        first += len(h["x0"](0.0, 0.0)) if "part" in h else 0
+    return 1
 
 
 def _moved(y: list[float], h: float, k: list[float]) -> list[float]:

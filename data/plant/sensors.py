@@ -116,8 +116,8 @@ class Chain:
             if len(self._times) > 4096 and self._times[2048] < t - self.delay - self.window - self.window_i:
                 del self._times[:2048], self._speeds[:2048], self._charges[:2048]
 
-    def read(self, t: float, y: list[float], v: float) -> dict[str, float]:
-        """Return what is seen at the time t of the state y, with v volts commanded."""
+    def read(self, t: float, theta: float, v: float) -> dict[str, float]:
+        """Return what is seen at the time t of the angle theta, with v volts commanded."""
         w = self._before(self._speeds, t - self.delay) if self.delay else self.w
         if self.window:
             begun = self._omega0 * min(t - self.window, 0.0)
@@ -125,9 +125,9 @@ class Chain:
         i = (self._charge - self._before(self._charges, t - self.window_i)) / self.window_i if self.window_i else self.i
         i = self.current_gain * self.duty(v) * i + self.offset
         part, periods, phase, angle = self.ripple
-        w *= 1 + part * sin(periods * y[2] + phase)
-        theta = y[2] - angle * part / periods * cos(periods * y[2] + phase) - (self.lag_th or 0.0) * self._behind
-        return {"i": i, "omega": self.gain * w + self.speed_offset, "theta": theta}
+        w *= 1 + part * sin(periods * theta + phase)
+        read = theta - angle * part / periods * cos(periods * theta + phase) - (self.lag_th or 0.0) * self._behind
+        return {"i": i, "omega": self.gain * w + self.speed_offset, "theta": read}
 
     def _before(self, kept: list[float], t: float) -> float:
         """Return what was kept of the time t, or of the start before it."""

@@ -1,7 +1,6 @@
 """A bench made of software: a motor with a hidden effect behind a converter and an encoder, speaking the protocol.
 
-`VirtualDevice` knows nothing of wires or clocks: `server` serves it over a pseudo-terminal in real time. The equations
-are those of the plant, which shares no code with the models."""
+`VirtualDevice` knows no wire or clock, `server` serves it in real time; its plant shares no code with the models."""
 
 import math
 import time

@@ -38,7 +38,7 @@ from motorid.records.experiment import Experiment
 SHORTLIST = 6
 PAIRS = 3  # refitted where no single effect helps, and beside one that is refused
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
-ALWAYS = ("compliance", "speed_lag", "speed_delay", "driver_coast")  # their score at null says little
+ALWAYS = ("compliance", "compliance_load_side", "speed_lag", "speed_delay", "driver_coast")  # scores at null mislead
 OVER_TURN = next(f for f in FORMS if (f.balance, f.carrier, f.on) == ("torque", "direction", "turn"))
 SIMPLER = {"end_stop": ("spring",), "speed_filter": ("speed_average",)}  # near an effect, and simpler
 FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have a limit
@@ -323,8 +323,7 @@ class Search:
         return listed + [c for n, c in judged.items() if n not in scored]
 
     def pruned(self, node: Node, before: Node) -> Node:
-        """Return `node` without effects that have become superfluous, with the simplest of each kind, still preferred
-        to the model `before`: small losses, each by chance, may add up."""
+        """Return `node` without superfluous effects, the simplest of each kind, and still preferred to `before`."""
         for e in node.fit.problem.model.effects:
             simpler = self._simpler(node.fit.model, e)
             alone = e.name == node.added and node.parent is not None and len(node.key - node.parent.key) == 1
@@ -366,8 +365,7 @@ class Search:
         return self._fitted(node, node.fit.model) if node.fit.status != "converged" and far(node.fit) else node
 
     def led_out(self, node: Node, larger: Node) -> Node:
-        """Return a model fitted on from where a larger one ended, if that predicts better: its own descent had stopped
-        in a valley, and what the larger one has more only led it out."""
+        """Return a model led by a larger one out of the valley where its descent stopped, if it predicts better so."""
         fit = None if node is self.root else led_on(node.fit, larger.fit)
         if fit is not None and beats(onward := replace(node, fit=fit, predictions=self.held.predictions(fit)), node):
             self._scores.pop(node.key, None)

@@ -50,7 +50,7 @@ BOTH_WAYS = 0.5  # of the larger side that the smaller one reaches at least: bot
 FINER = 4  # times as many places and knees in a curve that is fitted: what is narrow stands between the few
 WHERE = {"torque": "mechanical", "transmission": "mechanical", "voltage": "electrical", "both": "electrical",
          "coupling": "mechanical", "load": "mechanical", "sensor": "sensor"}
-LOADS = {"load": "r_load", "geared": "r_gap", "slip": "r_slip", "free": "r_free"}  # end of its states' names, its share
+LOADS = {"load": "r_load", "far": "r_far", "geared": "r_gap", "slip": "r_slip", "free": "r_free"}  # of states; share
 COUPLED = ("twist", "slip", "load speed")  # what is known of the load where the model has one
 CHANGES = {"t": "changes with the time", "distance": "changes with the distance run",
            "turn": "changes with the angle within a turn", "theta": "changes with the angle",

@@ -244,10 +244,9 @@ def without_spikes(fit: Fit) -> Reading | None:
 def better_reading(fit: Fit, late: bool = False, earlier: bool = False) -> Reading | None:
     """Return the reading of the voltage that the records ask for; None if it is the one they have.
 
-    It must make the error of `fit` plainly smaller, and that of no channel larger; errors that are all noise cannot
-    become so. Dead times that show at the steps come first: friction and inductance would adapt to them. `late`: all
-    effects that help are in, and what could stand in for one is tried too. `earlier`: only a voltage that acts earlier
-    is, whatever is missing; no motor answers before it is asked."""
+    It must make the error of `fit` plainly smaller, and that of no channel larger; what is all noise cannot be. Dead
+    times that show at the steps come first: friction and inductance would adapt to them. `late`: all effects that help
+    are in; what could stand in for one is tried too. `earlier`: only a voltage that acts so, as no motor can."""
     chosen, fall, runs = None, PLAIN, fit.problem.experiments
     calm = all(NOISE[0] < ratio < NOISE[1] for ratio in misfit_over_noise(fit.problem, fit.q).values())
     lost = sum(run.n for run in runs if unresolved(run))

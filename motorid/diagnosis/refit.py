@@ -242,8 +242,7 @@ def _fit_of(done: Estimate) -> Fit | None:
 
 
 def _converged(problem: Problem, effort: LevenbergMarquardt) -> Estimate:
-    """Descend while a step gains `TOLD` by the samples that the residual is worth, and go on where that ends at its
-    limit: what is unfinished would be judged worse than it is."""
+    """Descend while a step gains `TOLD` by the samples that the residual is worth: what is unfinished looks worse."""
     history = ()
     for _ in range(GOING_ON):
         done = by_continuation(problem, effort, wide=False, narrow=False)

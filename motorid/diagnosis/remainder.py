@@ -73,7 +73,7 @@ OTHER_PLACES = {"1": "where it sets in, a share of the largest", "V": "half of i
                 "rad:edge": "how wide its edges are", "1:damped": "how much its swing is damped",
                 "1:level": "how long it is on", "rad:slip": "how far it slips until what it drags along follows"}
 STRAIGHT = ("omega", "i", "v", *COUPLED)
-COUPLINGS = {"compliance", "backlash", "slip_clutch", "freewheel"}
+COUPLINGS = {"compliance", "compliance_load_side", "backlash", "slip_clutch", "freewheel"}
 OVER = {"": "", "A": "/A", "V": "/V", "rad/s": "·s/rad", "rad²/s²": "·s²/rad²", "A²": "/A²"}
 FIRST = {"past i": ", m.start['i']", "past omega": ", m.start['omega']"}  # of a memory: as if it had been so before
 CLIPPED = re.compile(r"ca\.fmin\(ca\.fmax\(z, \S+\), \S+\)")
@@ -539,8 +539,7 @@ class Remainder:
         return replace(self, fit=fit, _root=root[0] if root else None, forms=_forms_beside(fit), _records=())
 
     def _coupled(self) -> Iterator[tuple[Curve, Form]]:
-        """Yield the model with a shaft or a clutch, whatever else only approximates left out, with what is known of the
-        load behind it; a shaft with play is one that stiffens, too."""
+        """Yield a shaft (for one with play, too) or clutch, without what approximates, and forms of its load."""
         coupled = {e.name for e in self.fit.model.effects} & COUPLINGS
         base = (_without(self.fit, self._approximating.keys() - coupled) or self.fit) if coupled else None
         with contextlib.suppress(ModelError):

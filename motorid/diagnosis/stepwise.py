@@ -433,9 +433,8 @@ def _in_windows(found: Climb) -> Fit | None:
     """Return the first model's fit in windows, if one that it led to carries small errors too far over whole records.
 
     A pendulum upright says so only with its weight in the model; detents may be refused as the motor rested in others.
-    Where the last model loses a channel, an axis drifts: no force is known so well that its sum is the motion. So it
-    may where a spring draws back what the first one loses: in a position loop that helps, whatever is missing. What
-    leaves noise alone on whole records is no matter of chance."""
+    Where the last model loses a channel, an axis drifts: no force is known so well that its sum is the motion; or where
+    a spring draws back what the first one loses: in a position loop that always helps. Noise alone is no chance."""
     if at_noise(found.path[-1]):
         return None
     first, last = found.path[0].fit, found.path[-1].fit

@@ -162,8 +162,8 @@ CORNER = 0.01  # of half a gap: a stiff shaft is twisted by much less than the g
 WIDE = 0.1  # rad: which a corner wider than a thousandth of a radian is, however large the gap
 
 
-def _two_inertias(m: Equations, share, resonance, zeta, twist_of, name: str) -> None:
-    """Split J into motor and load joined by a shaft; `twist_of` shapes the elastic twist (a gap).
+def _two_inertias(m: Equations, share, resonance, zeta, twist_of, name: str) -> tuple[ca.SX, ca.SX]:
+    """Split J into motor and load joined by a shaft, return its twist and slip; `twist_of` shapes the elastic twist.
 
     The total stays J. With load share r, stiffness ω_r²·J·r·(1−r), damping 2·ζ·ω_r·J·r·(1−r), all vanishes as r → 0."""
     twist, omega_load = m.state(f"twist_{name}"), m.state(f"omega_{name}", m.start["omega"])
@@ -175,6 +175,7 @@ def _two_inertias(m: Equations, share, resonance, zeta, twist_of, name: str) -> 
     m.rate(omega_load, per_share)
     m.scale("J", 1 - share)
     m.torque -= m.symbols["J"] * share * per_share
+    return twist, slip
 
 
 @effect(balance="transmission")
@@ -183,6 +184,17 @@ def compliance(m: Equations, r_load=SHARE,
                zeta_r=P(0.05, "", positive=True, upper=2.0, grid=(0.05, 0.3), doc="damping ratio of the resonance")):
     """Elastic shaft between two inertias. Ellis, Control System Design Guide, ch. 16, 2012."""
     _two_inertias(m, r_load, omega_r, zeta_r, lambda twist: (twist, 1.0), "load")
+
+
+@effect(balance="transmission")
+def compliance_load_side(m: Equations, T_far=P(5e-3, "s", null=0.0, positive=True, grid=(2.0, 5.0, 15.0, 50.0),
+                                               doc="1/resonance of the two inertias"),
+                         r_far=P(0.5, "", positive=True, upper=0.98, grid=(0.5,), doc="load's share of the inertia"),
+                         zeta_far=P(0.1, "", positive=True, upper=2.0, grid=(0.1,), doc="damping of the resonance")):
+    """Speed and angle sensed behind an elastic shaft, at its load. Ellis, Control System Design Guide, ch. 16, 2012."""
+    twist, slip = _two_inertias(m, r_far, 1 / T_far, zeta_far, lambda twist: (twist, 1.0), "far")
+    m.measure("omega", m.measured("omega") - slip)
+    m.measure("theta", m.measured("theta") - twist)
 
 
 @effect(balance="transmission", includes=("compliance",))

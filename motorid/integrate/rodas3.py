@@ -81,8 +81,7 @@ def rosenbrock_step(system: System, x, u0, u1, h, p):
 
 
 def _elimination_order(w: ca.SX) -> list[int]:
-    """Return the order of the states that fills W least (Markowitz, Management Science 3(3), 1957), their own if that
-    fills no more: what only remembers the motor goes before it."""
+    """Return the order of states that fills W least (Markowitz, Management Science 3(3), 1957); on a tie their own."""
     pattern, orders = np.array(ca.DM(w.sparsity(), 1)) != 0, []
     for freely in (False, True):
         filled, left, order = pattern.copy(), list(range(len(pattern))), list[int]()

@@ -106,8 +106,7 @@ def png_of(axes: Any) -> bytes:
 
 
 def svg_of(draw: Callable[..., Any], *args: Any, name: str, alt: str, **options: Any) -> str:
-    """Draw with `draw`, e.g. `plot_fit`, and return an inline ``<svg>`` element. `name` is the prefix of the names
-    inside, unique on the page; `alt` says what the figure shows."""
+    """Return what `draw`, e.g. `plot_fit`, shows as inline ``<svg>``; `name` begins names inside; `alt` says it."""
     with detached():
         figure = np.ravel(np.asarray(draw(*args, **options), object))[0].figure
     if (engine := figure.get_layout_engine()) is not None:

@@ -1,4 +1,3 @@
 """A run as measured: `reading.read_runs` makes an `experiment.Experiment` of a file; units end here.
 
-Bytes become a table in `tables`, its columns channels by `headers`, and these a run in `cleaning`; `checks` says what
-looks wrong with it, `preprocessing` mends what a user asks for."""
+`tables` reads bytes, `headers` finds channels, `cleaning` makes a run; `checks` warns, `preprocessing` mends."""

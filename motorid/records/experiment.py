@@ -32,8 +32,7 @@ PARTS = ("motorid record", "motorid part")  # extra columns that change where th
 class Experiment(Shown):
     """One run: what went in and what was measured, on one time axis.
 
-    Everything is validated here and nowhere else. Arrays are copied to read-only float64, mappings are made
-    read-only, so a run can be shared between models and processes.
+    All is validated here, and nowhere else; arrays (copied, float64) and mappings are read-only, to be shared safely.
 
     Parameters
     ----------

@@ -131,8 +131,7 @@ def bursts(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
 
 
 def fading(t: Array, y: Array, v: Array) -> NDArray[np.intp]:
-    """Return which samples jump at one voltage far beyond all that is reached else, and fade to where they were: a
-    filter's answer to an angle that wraps, or to a wrong sample."""
+    """Return which samples jump far beyond all else at one voltage, and fade: a filter's answer to a wrapped angle."""
     seen = np.flatnonzero(np.isfinite(y))
     here, level = y[seen], np.cumsum(np.abs(np.diff(v, prepend=v[0])) > 0.02 * np.ptp(v))[seen]
     sizes, found = np.abs(np.diff(here)), [np.empty(0, int)]

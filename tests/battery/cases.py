@@ -132,6 +132,7 @@ SINGLES = [
         channels=ANGLE,
     ),
     single("compliance", "lab", {"k_s": 0.9, "c_s": 4e-4, "J_l": 2.5e-5}, train=("prbs", "stairs")),
+    single("compliance_load_side", "lab", {"k_s": 0.9, "c_s": 4e-4, "J_l": 2.5e-5}, train=("prbs", "stairs")),
     single(
         "backlash",
         "servo",

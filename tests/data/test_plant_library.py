@@ -43,7 +43,7 @@ def test_library_effect_does_what_the_plant_does(plant, name):
     model = dc_motor(R=motor.R, L=motor.L, K=motor.K, b=motor.b, J=J) + LIBRARY[name]
     t, v = plant.staircase([2, -1, 0.6, 0], 0.05)
     r = plant.simulate(motor, {name: NUMBERS[name]}, t, v)
-    channels = ("i", "omega", "theta") if name == "angle_lag" else ("i", "omega")
+    channels = ("i", "omega", "theta") if name in ("angle_lag", "compliance_load_side") else ("i", "omega")
     for channel, y in zip(channels, by_library(model.replace(**numbers), t, v, channels), strict=True):
         error = np.sqrt(np.mean((y - r[channel]) ** 2) / np.mean(r[channel] ** 2))
         assert error < INEXACT.get(name, 1e-6), channel
@@ -54,8 +54,8 @@ def test_the_library_and_the_plant_know_the_same_effects_by_the_same_words(plant
     assert set(NUMBERS) == set(plant.LIBRARY) | set(plant.BEYOND)
     assert len(plant.BEYOND) >= 3
     # a stiffness there, a frequency here
-    shaped_otherwise = {"lugre", "compliance", "backlash", "slip_clutch", "freewheel", "driver_coast",
-                        "driver_one_quadrant"}
+    shaped_otherwise = {"lugre", "compliance", "compliance_load_side", "backlash", "slip_clutch", "freewheel",
+                        "driver_coast", "driver_one_quadrant"}
     for name in set(LIBRARY) - shaped_otherwise:
         assert set(NUMBERS[name]) <= {p.name for p in LIBRARY[name].parameters}, name
 

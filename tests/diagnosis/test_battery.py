@@ -17,7 +17,7 @@ from motorid.effects import LIBRARY
 
 HERE = Path(__file__).parents[1]
 PART = ("magnetic_saturation", "coulomb_coloured", "driver_dead_band+magnetic_saturation", "none_outliers",
-        "driver_one_quadrant", "angle_lag", "current_average")
+        "driver_one_quadrant", "angle_lag", "current_average", "compliance_load_side")
 
 
 def test_the_battery_covers_what_it_promises():

@@ -22,7 +22,7 @@ RUN = Path(__file__).parents[1] / "battery" / "blind" / "run.py"
 
 LATER = {"current_average", "driver_voltage_limit", "driver_lag", "speed_filter", "driver_slew", "pwm_coast",
          "pwm_fast_decay", "slip_clutch", "freewheel", "end_stop", "speed_ripple", "driver_one_quadrant",
-         "angle_lag"}  # than these
+         "angle_lag", "compliance_load_side"}  # than these
 
 
 def of(battery, kind):

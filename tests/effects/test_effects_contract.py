@@ -185,6 +185,8 @@ def test_says_what_it_is_with_units_limits_and_source(effect):
             "mu",
             "r_load",
             "zeta_r",
+            "r_far",
+            "zeta_far",
             "zeta_f",
             "r_gap",
             "zeta_c",

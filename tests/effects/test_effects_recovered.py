@@ -31,6 +31,7 @@ TRUTH = {
     "viscous_asymmetric": {"b_a": 2e-5},
     "lugre": {"tau_c": 5e-3, "s_b": 1.6, "omega_s": 8.0, "theta_s": 0.02},
     "compliance": {"r_load": 0.4, "omega_r": 250.0, "zeta_r": 0.05},
+    "compliance_load_side": {"T_far": 4e-3, "r_far": 0.4, "zeta_far": 0.05},
     "backlash": {"r_gap": 0.5, "gap": 0.05, "omega_c": 400.0, "zeta_c": 0.3},
     "speed_lag": {"T_w": 4e-3},
     "speed_filter": {"T_f": 5e-3, "zeta_f": 0.4},
