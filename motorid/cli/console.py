@@ -27,7 +27,7 @@ from motorid.records.reading import find_records
 
 DONE, FAILED, WRONG, INTERRUPTED = 0, 1, 2, 130
 RESULTS = ("json", "report", "path", "remainder_to")
-INPUTS = ("runs", "validate", "fit_json", "effects_from", "found_json")
+INPUTS = ("runs", "directories", "validate", "fit_json", "effects_from", "found_json")
 _ASCII = {"Ω": "Ohm", "ω": "omega", "τ": "tau", "θ": "theta", "φ": "phi", "α": "alpha", "Δ": "Delta", "µ": "u",
           "μ": "mu", "·": "*", "×": "x", "±": "+-", "²": "^2", "°": "deg", "√": "sqrt", "…": "...", "→": "->",
           "•": "*", "–": "-", "—": "-", "−": "-", "─": "-", "━": "-", "│": "|", "≈": "~", "≤": "<=", "≥": ">=",
@@ -282,7 +282,7 @@ def _filled(text: str, width: int, first: str = "") -> str:
 def next_command(name: str, *more: str) -> str:
     """Return what to type next: this command line with another command and `more`, without what it writes."""
     words = iter(sys.argv[2:])
-    dropped = OUTPUTS if name == "diagnose" else (*OUTPUTS, "--budget", "--max-effects", "--remainder-to")
+    dropped = OUTPUTS if name == "diagnose" else (*OUTPUTS, "--budget", "--max-effects", "--remainder-to", "--jobs")
     kept = [w for w in words if not (w in dropped and next(words, None))
             and w.partition("=")[0] not in (*dropped, "--force")]
     line = shlex.join(["motorid", name, *kept, *more])

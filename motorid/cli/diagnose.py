@@ -92,9 +92,9 @@ def diagnose_command(runs: opt.Runs, options: opt.FitOptions, validate: opt.Vali
     save_report(found, report, held_out, options.force, quiet=json == "-")
     if remainder_to:
         assert found.remainder is not None
-        name = remainder_to.stem
+        name = stem if (stem := remainder_to.stem).isidentifier() else "remainder"
         with parallel.budget(budget):
-            law = found.remainder.code(name if name.isidentifier() else "remainder")
+            law = found.remainder.code(name)
         write_files({remainder_to: law}, options.force)
         effects = ",".join((*found.remainder.model.effect_names, name))
         show(None if json == "-" else

@@ -60,8 +60,7 @@ def identify_on(bench: str | Link, folder: str | Path = ".", *, goal: str = "dis
                 **options: Any) -> Campaign:
     """Identify a motor on a bench: record, fit, diagnose, design the next record, until all is determined.
 
-    Each designed voltage was checked against every rival before it is played; the device enforces `v_max` and `i_max`
-    while it is. **The motor will move: keep clear of the shaft.**
+    Each voltage was checked against every rival; the device enforces the limits. **The motor will move: keep clear.**
 
     Parameters
     ----------

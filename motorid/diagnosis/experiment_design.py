@@ -26,7 +26,7 @@ from motorid.model.model import Model
 from motorid.numerics import parallel
 from motorid.numerics.signals import Array
 from motorid.problem.simulate import planned
-from motorid.records.experiment import Experiment
+from motorid.records.experiment import Experiment, units_of
 from motorid.records.files import write_files
 
 SAMPLES = 2000
@@ -63,7 +63,7 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
     fits : sequence of Fit
         At least two rival models, fitted to the same records.
     v_max, i_max : float, optional
-        Limits in V and A; by default the largest in the records.
+        Limits in V and A; by default the largest voltage in the records, and no limit of the current.
     duration : float, optional
         s; by default that of the longest record.
 
@@ -81,6 +81,7 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
         raise UsageError("suggest_experiment() compares models: give at least two fits of the same records.")
     positive(OMITTED, v_max=v_max, i_max=i_max, duration=duration)
     runs = fits[0].problem.experiments
+    units = {c: u for c, u in units_of(runs).items() if c in ("v", *fits[0].problem.outputs)}
     v_max = v_max or max(float(np.abs(r.inputs["v"]).max()) for r in runs)
     duration = duration or max(r.duration for r in runs)
     dt = float(np.median([r.dt for r in runs]))
@@ -95,7 +96,7 @@ def suggest_experiment(fits: Sequence[Fit], *, v_max: float | None = None, i_max
                 scores[name] = min(float(np.mean([np.mean(((a[c] - b[c]) / sigma[c]) ** 2) for c in a if c in sigma]))
                                    for a, b in combinations(answers, 2))
                 text = f"{what} (up to {quantity(v_max, runs[0].units['v'], 3)}, {duration:.3g} s)"
-                kept[name] = Suggestion(name, text, Experiment(t, {"v": v}, answers[0], name=name), scores)
+                kept[name] = Suggestion(name, text, Experiment(t, {"v": v}, answers[0], name=name, units=units), scores)
     if not scores:
         raise FitError("no candidate experiment stays within the limits with all models; raise i_max or v_max.")
     return kept[max(scores, key=lambda n: scores[n])]
@@ -218,11 +219,10 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     to the truth, refitted to all records, in the mean over the rivals as truths, up to where more is worth nothing
     (compound: Ponce de Leon & Atkinson, Biometrika 78, 1991). The truth lies anywhere within two standard deviations
     of its values, or as fitted where that would hide the difference; an effect that the records leave open is as large
-    as they allow. Sharpening is D_s-optimal for one parameter (Fedorov,
-    Theory of Optimal Experiments, 1972); for several, the product of their variances by the Fisher information, that
-    of the records so far included. Both are solved as an NLP, by sequential linear programming with the exact
-    derivatives of the discrete step, from fixed candidates and, to sharpen, from waves with current or speed at the
-    limit; the limits are constraints for every rival, and the voltage shrinks until drawn parameters keep them too.
+    as they allow. Sharpening is D_s-optimal for one parameter (Fedorov, Theory of Optimal Experiments, 1972); for more,
+    the product of their variances by the Fisher information, that of the records so far included. Both are an NLP, by
+    sequential linear programming with exact derivatives of the discrete step, from fixed candidates and, to sharpen,
+    waves at the limit of current or speed; limits hold for every rival, and for drawn parameters by a smaller voltage.
 
     It is a local optimum, as good as the rivals: where all are wrong, neither gain nor limits are guaranteed.
 
@@ -267,6 +267,8 @@ def design_experiment(found: Diagnosis | Fit | Sequence[Fit | Rival], *, goal: s
     at_least(0, budget=budget)
     rivals, goal = _rivals(found, goal)
     asked = tuple(chosen(parameters, rivals[0].model.free_names, "free parameter")) if goal == "sharpen" else ()
+    if parameters and goal != "sharpen":
+        raise UsageError("parameters are sharpened, and rivals distinguished: say goal='sharpen', or leave them out.")
     if goal == "sharpen" and not asked:
         raise UsageError("the model has no free parameter to sharpen; free some with model.free(…).")
     _check_words(shape, levels, slew)

@@ -207,8 +207,7 @@ def _polished(fit: Fit, problem: Problem, effort: LevenbergMarquardt) -> Fit | N
 
 
 def led_on(fit: Fit, larger: Fit | None = None) -> Fit | None:
-    """Return a refit led on to its optimum, along the model's own angle where that no longer drifts; from where that of
-    a `larger` model ended, if it costs less there. None for none."""
+    """Return a refit led on to its optimum, by its own angle if that drifts no more, or from a `larger` one's end."""
     descent, problem, q = partial(by_continuation, effort=OPTIMUM, wide=False), fit.problem, fit.q
     if larger is not None:
         there = {**larger.initial, **larger.values}

@@ -482,10 +482,12 @@ class Remainder:
         """The curve with which the model, fitted anew, predicts best."""
         if self.kind != "structure":
             raise UsageError(f"the remainder is {self.kind}: nothing is left that a curve over a quantity predicts.")
-        with contextlib.suppress(OutOfTime):
+        try:
             if (best := self._best) is not None:
                 self._stopped.clear()
                 return best.curve
+        except OutOfTime:
+            raise UsageError("the time was up before any curve was known to help: allow more of it.") from None
         raise UsageError("something predictable is left, but no curve over one quantity lowers the error on data "
                          "left out; do these hold voltages or speeds that others lack?")
 

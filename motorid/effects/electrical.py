@@ -169,8 +169,7 @@ def driver_slew(m: Equations, T_r=P(0.1, "s", null=0.0, positive=True, grid=(4.0
                 V_w=P(0.1, "V", positive=True, grid=(0.01, 0.1), doc="how far behind it is at 3/4 of its fastest")):
     """Slew-rate limit of the driver (ramp, soft start), V_s/T_r·tanh(Δv/V_w). Franco, Operational Amplifiers, 2015.
 
-    Seen as steps that come as ramps, the larger the later; small ones as through a lag of T_r·V_w/V_s. Unless V_s is
-    given it is the largest voltage of the records."""
+    Seen as steps that come as ramps, small ones as through a lag of T_r·V_w/V_s. V_s: if not given, the largest."""
     z = m.state("v_ramped", m.base("R") * m.start["i"] + m.base("K") * m.start["omega"])
     m.rate(z, V_s / T_r * ca.tanh((m.v - z) / (V_w + V_s * NO_RAMP / T_r)))
     m.voltage -= m.v - z

@@ -59,8 +59,7 @@ def angular_friction(m: Equations, tau_m=P(2e-3, "N·m", null=0.0, lower=0.0, do
                      phi_f=P(0.0, "rad", periodic=True, grid=QUARTERS, doc="phase at theta = 0")):
     """Friction that varies over a turn (a bent shaft), τ(1+a·sin(Nθ+φ))·sgn ω. Armstrong-Hélouvry, 1991.
 
-    Seen as a friction that repeats every turn in both directions: turn slowly, measure the angle. Once or twice a turn
-    (a coupling out of line), what suits, unless N_f is given."""
+    Seen as a friction that repeats every turn, both ways: turn slowly, with the angle. Once or twice a turn (N_f)."""
     m.torque -= tau_m * (1 + a_f * ca.sin(N_f * m.theta + phi_f)) * m.sign(m.omega)
 
 
@@ -97,8 +96,7 @@ def gear_efficiency(m: Equations, mu_d=P(0.1, "", null=0.0, lower=0.0, upper=1.0
                     mu_b=P(0.2, "", null=0.0, lower=0.0, doc="share lost when it is driven back")):
     """Efficiency of the gear, another share of the torque when driven back. Wang & Kim, ICRA, 2015.
 
-    Only with J known (fixed) can the two shares be determined; otherwise `load_friction` does the same with another J.
-    Seen in hard braking beside hard acceleration."""
+    Only with J fixed are both shares determined, else `load_friction` does as well. Seen in hard braking, starting."""
     carried, s = m.K_t * m.i if "i" in m.states else m.g * m.v, m.sign(m.omega)
     m.torque -= s * (mu_d * (ca.fabs(carried) + carried * s) + mu_b * (ca.fabs(carried) - carried * s)) / 2
 
@@ -132,8 +130,7 @@ def end_stop(m: Equations, k_stop=P(1e-2, "N·m/rad", null=0.0, lower=0.0, doc="
              d_stop=P(0.01, "s/rad", lower=0.0, grid=(0.3,), doc="damping of an impact, over its stiffness")):
     """End stops of the travel, k·x·(1+d·dx/dt) at x beyond one. Hunt & Crossley, J. Appl. Mech. 42(2), 1975.
 
-    Seen as an angle that goes no further, however large the voltage: drive to both ends, angle measured. The angle of
-    a stop that was never reached is not determined."""
+    Seen as an angle that goes no further at any voltage: drive to both ends; a stop never reached is not determined."""
     above, below = ca.fmax(m.theta - theta_hi, 0), ca.fmax(theta_lo - m.theta, 0)
     m.torque -= k_stop * (above * ca.fmax(1 + d_stop * m.omega, 0) - below * ca.fmax(1 - d_stop * m.omega, 0))
 

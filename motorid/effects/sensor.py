@@ -127,9 +127,8 @@ def supply_side_current(m: Equations, V_dc=P(12.0, "V", positive=True, vary=Fals
                         u_i=P(0.0, "", vary=False, lower=0.0, upper=1.0, grid=(1.0, 0.0), doc="1: no sign, fixed")):
     """Current of the supply, not the motor's: d·i, d = abs(v)/V_dc. Mohan, Electric Machines and Drives, 2012.
 
-    With u_i = 1 it counts positive out of the supply, whichever way the motor turns; what suits, unless given. Unless
-    V_dc is given it is the largest voltage of the records; a larger one leaves R, L, b and J wrong by that factor.
-    Seen as next to no current at small duties, whatever the load."""
+    With u_i = 1 it counts positive out of the supply; what suits, unless given, as is the largest voltage for V_dc: a
+    larger one leaves R, L, b and J wrong by that factor. Seen as next to no current at small duties, at any load."""
     duty = ca.fmin(ca.fabs(m.command) / V_dc, 1) * (1 + u_i * (ca.sign(m.command) - 1))
     m.measure("i", m.measured("i") * (1 - s_i + s_i * duty))
 

@@ -41,6 +41,7 @@ class Exported:
 
     functions: Mapping[str, ca.Function]  # by name, see `motorid.exporters.casadi_file.functions_of`
     info: Mapping[str, Any]  # what ``fit --json`` holds, with covariance, fingerprints of the records and versions
+    effects: Iterable[Effect] = ()  # of the user's own, as given to `load`
 
     @property
     def values(self) -> dict[str, float]:
@@ -49,8 +50,8 @@ class Exported:
 
     @property
     def model(self) -> Model:
-        """The model, if all its effects are in the library; else see `model_from_json`."""
-        return model_from_json(self.info)
+        """The model; ModelError if it has an effect that neither the library nor `effects` has."""
+        return model_from_json(self.info, self.effects)
 
     def simulate(self, k: int = 0, u: Array | None = None) -> Array:
         """Return the outputs (N, ny) on record `k` of the fit, with its own inputs or others of the same length."""
@@ -148,9 +149,9 @@ def load(path: str | os.PathLike[str], effects: Iterable[Effect] = (), *,
         return _fit_of(contents, effects, source.name) if "fit" in contents else model_from_json(contents, effects)
     try:
         if not trust:
-            return Exported(*read_casadi(data))
+            return Exported(*read_casadi(data), tuple(effects))
         file = ca.FileDeserializer(str(source))
-        return Exported({f.name(): f for f in file.unpack()}, json.loads(file.unpack()))
+        return Exported({f.name(): f for f in file.unpack()}, json.loads(file.unpack()), tuple(effects))
     except (RuntimeError, ValueError, TypeError, AttributeError, LookupError):  # RecursionError is a RuntimeError
         other = source.suffix.lower() != ".casadi"
         raise DataError(f"cannot read {source.name}: {NOT_OURS}" + ("." if other else ", or an older version did. If "

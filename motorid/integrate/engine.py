@@ -92,8 +92,7 @@ class Engine(Protocol):
             dp: Array | None = None) -> Trajectory:
         """Return the trajectory from `x0` (nx,) with parameters `p` (np,).
 
-        `dx0` (nx, nq) and `dp` (np, nq) are the derivatives of both with respect to the unknowns q. SimulationError,
-        which names the time, if the integration does not reach the end."""
+        `dx0` (nx, nq), `dp` (np, nq): slopes by the unknowns q. SimulationError, with the time, where it fails."""
         ...
 
     def prepare(self, system: System, grid: Grid, x0: Array, p: Array, tolerance: Tolerance) -> Grid:

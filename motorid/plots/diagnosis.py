@@ -132,7 +132,8 @@ def plot_answer(found: Diagnosis, ax: Axes | None = None) -> Axes:
         ax.plot(b.centre, b.mean, "--", color=style.PALETTE["orange"], lw=2.0, label=label)
     ax.axhline(0, color=style.MUTED, lw=0.6)
     noun = "force" if (unit := "V" if balance == "voltage" else m.torque_unit) == "N" else balance
-    name = f"phase of {periods:g} periods per turn (rad)" if periods != 1 else style.axis_label(against)
+    run = found.before.problem.experiments[0]
+    name = f"phase of {periods:g} periods per turn (rad)" if periods != 1 else style.axis_label(against, run)
     ax.set(xlabel=name, ylabel=style.scaled_title(f"missing {noun}", unit, power), title=f"The missing {noun}")
     ax.legend(loc="upper left", bbox_to_anchor=(0.0, -0.16), borderaxespad=0.0)  # below, where it covers no curve
     return ax
@@ -216,7 +217,7 @@ def plot_ladder(result: Ladder | Diagnosis, ax: Axes | None = None) -> Axes:
     ax = style.only(ax, width=max(5.6, 1.5 + 1.25 * len(rungs)), height=3.4)
     x = np.arange(len(rungs), dtype=float)
     for c, colour in zip(rungs[0].nrmse, style.CYCLE, strict=False):
-        name = style.axis_label(c).split(" (")[0]
+        name = style.axis_label(c, rungs[0].fit.problem.experiments[0]).split(" (")[0]
         ax.plot(x, [100 * r.nrmse[c] for r in rungs], "o-", color=colour, ms=5.5, label=f"{name}, fitted")
         if all(r.validation_nrmse and c in r.validation_nrmse for r in rungs):
             ax.plot(x, [100 * (r.validation_nrmse or {})[c] for r in rungs], "s--", color=colour, mfc="white", ms=5.5,

@@ -1,7 +1,6 @@
 """What a fit must respect beside the data: a current limit, the steady state, a relation of the user's own.
 
-As a *penalty* its rows add to the least-squares residual (`Relation.evaluate`); as a *true constraint* of
-`MultipleShooting` they stay between limits (`Relation.parts`)."""
+As a *penalty* its rows add to the residual (`Relation.evaluate`), as a *true constraint* they keep limits (`parts`)."""
 
 import warnings
 import weakref

@@ -262,8 +262,7 @@ def evaluate(fit_or_model: Any, runs: Sequence[Experiment] | Experiment, **optio
     """Judge a fit (or a model at its values) on `runs` that it may never have seen.
 
     Unknown initial states of these runs are estimated from them; no parameter is, but one that is another in every run
-    (a zero of the encoder, a supply): its error here is no proof of it. A fit in windows is judged in
-    windows of the same length, by what it predicts a window ahead.
+    (a zero of the encoder): its error here is no proof of it. A fit in windows is judged by what it predicts one ahead.
 
     Parameters
     ----------

@@ -55,7 +55,7 @@ def parse_unit(text: str) -> Unit | None:
         unit, factor = parse_unit(scaled[2]), float(scaled[1])
         if unit is None or not 1e-50 < abs(factor) < 1e50:
             return None
-        return Unit(unit.dimension, factor * unit.factor, unit.symbol, label)
+        return Unit(unit.dimension, factor * unit.factor, unit.symbol, label, unit.offset)
     word = re.sub(r"[\s·*.^]", "", label.translate(_LETTERS).lower().replace("per", "/"))
     if counts := _COUNTS.fullmatch(word):
         return _counts(label, counts[1], counts[2])
@@ -337,7 +337,7 @@ def assign(labels: Sequence[str], *, columns: Mapping[str, object] | None = None
     plain = [f"{c} ('{p.column}') in {p.unit.symbol}" for c, p in places.items()
              if not p.stated and p.column in (values or labels)]
     notes += [f"took {', '.join(guesses)}, a guess from the headers; override with columns."] if guesses else []
-    notes += [f"no unit stated, assuming {', '.join(plain)}; override with units."] if plain else []
+    notes += [f"no known unit stated, assuming {', '.join(plain)}; override with units."] if plain else []
     return Layout({c: places[c] for c in DIMENSIONS if c in places}, notes)
 
 

@@ -7,7 +7,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from motorid.channels import NAMES
+from motorid.channels import channel_name
 from motorid.diagnosis.results import Diagnosis, Ladder, ladder_table, ranking_table, share_table
 from motorid.display.cards import Flag, Shown, Table
 from motorid.display.numbers import counted, duration, glued, number, percent, sentence, with_error
@@ -17,7 +17,7 @@ from motorid.estimation.result import Fit, ended, parameter_table, value_tables
 from motorid.numerics.parallel import progress
 from motorid.problem.simulate import error_table, evaluate
 from motorid.records.checks import check_runs, reading_notes
-from motorid.records.experiment import Experiment
+from motorid.records.experiment import Experiment, units_of
 from motorid.records.files import package_version, write_files
 
 PACKAGES = ("motorid", "casadi", "numpy", "scipy", "pandas", "matplotlib")
@@ -150,7 +150,7 @@ def _of_ladder(ladder: Ladder) -> Story:
 
 def _of_fit(fit: Fit, validate: Sequence[Experiment]) -> Story:
     card, runs = fit.card(), fit.problem.experiments
-    facts = [(f"Error of the {NAMES[c]}", percent(e)) for c, e in fit.nrmse.items()]
+    facts = [(f"Error of the {channel_name(c, runs[0].units.get(c, ''))}", percent(e)) for c, e in fit.nrmse.items()]
     known = [fit.determined[n] for n in ("gain", "time_constant") if n in fit.determined]
     facts += [(q.text.capitalize(), with_error(q.value, q.std, q.unit)) for q in known]
     figure = _figure("residuals", "Noise alone would leave means of zero against every quantity and no correlation in "
@@ -185,7 +185,7 @@ class Section:
 def _data(runs: Sequence[Experiment]) -> Section:
     """The records and what the checks say of them."""
     rows = [[r.name, str(r.n), duration(r.duration), f"{number(1e3 * r.dt, 3)} ms",
-             ", ".join(NAMES[c] for c in r.channels)] for r in runs]
+             ", ".join(channel_name(c, r.units[c]) for c in r.channels)] for r in runs]
     remarks = [*check_runs(runs), *reading_notes(runs)]
     checked = "What the checks found:" if remarks else "The checks found no problem."
     figure = _figure("data", "Input and measured channels over time.",
@@ -285,4 +285,5 @@ def _error_facts(steps: Ladder) -> list[tuple[str, str]]:
     if first.validation_nrmse and last.validation_nrmse:
         kind, old, new = "held out", first.validation_nrmse, last.validation_nrmse
     arrow = [f"{percent(e)} → {percent(new[c])}" if last is not first else percent(e) for c, e in old.items()]
-    return [(f"Error of the {NAMES[c]}, {kind}", text) for c, text in zip(old, arrow, strict=True)]
+    names = [channel_name(c, units_of(last.fit.problem.experiments)[c]) for c in old]
+    return [(f"Error of the {name}, {kind}", text) for name, text in zip(names, arrow, strict=True)]

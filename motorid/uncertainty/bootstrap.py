@@ -19,7 +19,7 @@ from motorid.numerics.parallel import Map, map_items, one_thread
 from motorid.numerics.signals import Array
 from motorid.problem.problem import Problem
 from motorid.records.experiment import Experiment
-from motorid.uncertainty.covariance import covariance
+from motorid.uncertainty.covariance import check_level, covariance
 
 KINDS = ("blocks", "parametric", "runs")
 # Blocks lose the likeness across their joints: the variance comes out too small by about one over this.
@@ -55,6 +55,7 @@ class Bootstrap(Printed):
     def interval(self, name: str, level: float = 0.95) -> tuple[float, float] | None:
         """Return the percentile interval of a parameter; None where the data do not determine it."""
         among(name, self.names, "parameter")
+        check_level(level)
         if self.status[name] == "not determined":
             return None
         tail = 50 * (1 - level)

@@ -228,4 +228,5 @@ def intervals(fit: Fit, *, level: float = 0.95, kind: str = "blocks", n: int = 2
     >>> three = mi.intervals(fit, n=10, quiet=True)
     """
     refits = bootstrap(fit, kind=kind, n=n, seed=seed, map=map, quiet=quiet)
+    check_level(level)
     return Intervals(covariance(fit), refits, profiles(fit, level=level, map=map, quiet=quiet), level)

@@ -516,9 +516,9 @@ def test_what_to_type_next_is_one_line(monkeypatch):
     runs = ["run1.csv", "../hidden_friction/../hidden_friction/../hidden_friction/run2.csv"]
     monkeypatch.setattr(sys, "argv", ["motorid", "fit", *runs])
     assert f"Next: motorid diagnose {' '.join(runs)}" in motorid("fit", *runs).out.splitlines()
-    line = "motorid diagnose run.csv --budget 8 --max-effects=1 --hold zoh"
+    line = "motorid diagnose run.csv --budget 8 --max-effects=1 --jobs 2 --hold zoh"
     monkeypatch.setattr(sys, "argv", line.split())
-    assert next_command("fit") == "motorid fit run.csv --hold zoh", "fit takes no budget"
+    assert next_command("fit") == "motorid fit run.csv --hold zoh", "fit takes no budget, and no jobs"
 
 
 def test_held_out_errors_are_said_beside_the_noise():

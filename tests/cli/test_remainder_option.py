@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from command import motorid, motorid_json
 
 from motorid.records.datasets import data_path
@@ -9,13 +10,14 @@ from motorid.records.datasets import data_path
 RUNS = sorted(str(p) for p in data_path("hidden_friction").glob("run*.csv"))
 
 
-def test_what_is_left_is_written_and_fitted_again(tmp_path):
-    file = tmp_path / "left.py"
+@pytest.mark.parametrize(("file", "name"), [("left.py", "left"), ("my-law.py", "remainder")])
+def test_what_is_left_is_written_and_fitted_again(tmp_path, file, name):
+    file = tmp_path / file
     done = motorid("diagnose", *RUNS, "--max-effects", 0, "--remainder-to", file)
     assert done.status == 0
-    assert "--effects left" in done.out
+    assert f"--effects {name}" in done.out
     plain = motorid_json(tmp_path, "fit", *RUNS)
-    curved = motorid_json(tmp_path, "fit", *RUNS, "--effects-from", file, "--effects", "left")
+    curved = motorid_json(tmp_path, "fit", *RUNS, "--effects-from", file, "--effects", name)
     assert curved["nrmse"]["omega"] < 0.3 * plain["nrmse"]["omega"]
 
 

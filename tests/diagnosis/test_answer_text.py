@@ -364,3 +364,8 @@ def test_all_that_a_diagnosis_says_of_a_linear_axis_calls_its_angle_a_position(r
     assert [w for w in re.findall(r"\w* ?angle\b", json.dumps(found.to_dict())) if "phase" not in w] == []
     page = mi.report(found, tmp_path / "found.html").read_text(encoding="utf-8")
     assert "acts like a load that changes with the position" in page
+    assert "Error of the position, held out" in page
+    assert {*mi.plot_ladder(found).get_legend_handles_labels()[1]} >= {"position x, fitted", "speed v, held out"}
+    assert "rad" not in mi.plot_answer(found).get_xlabel()
+    plan = mi.suggest_experiment([found.best, found.before]).experiment
+    assert plan.units == {"v": "N", "omega": "m/s", "theta": "m"}

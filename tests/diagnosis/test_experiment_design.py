@@ -239,6 +239,8 @@ def test_tighter_limits_are_kept_for_every_rival(fits):
     assert tight.peaks["theta"] < 6
     with pytest.raises(FitError, match="limits"):
         mi.design_experiment(fits, i_max=1e-6, duration=DURATION, levels=LEVELS)
+    with pytest.raises(UsageError, match="rivals distinguished: say goal='sharpen'"):
+        mi.design_experiment(fits, parameters=["R"], duration=DURATION, levels=LEVELS)
 
 
 def test_by_default_it_stays_within_what_the_records_have_seen(first, fits):

@@ -403,6 +403,8 @@ def test_noise_is_no_effect(lab):
             ask()
     with pytest.raises(mi.UsageError, match="the remainder is fluctuation"):
         Remainder("fluctuation", found.best).as_effect()
+    with parallel.budget(1e-9), pytest.raises(mi.UsageError, match="the time was up before any curve"):
+        Remainder("structure", found.best).as_effect()
 
 
 @pytest.mark.parametrize("forced", [False, True])

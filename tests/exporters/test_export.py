@@ -213,6 +213,9 @@ def test_own_effect_says_what_is_needed_and_loads_with_it(tmp_path):
     with pytest.raises(ModelError, match=r"my_drag.*c_3.*effects=\[my_drag\]"):
         load(path)
     assert load(path, effects=[my_drag]).values == model.values
+    exported = load(export(model, tmp_path / "own.casadi"), effects=[my_drag])
+    assert exported.model.values == model.values
+    assert load(export(exported, tmp_path / "again.json"), effects=[my_drag]).values == model.values
 
 
 def test_limits_and_held_values_come_back(tmp_path):

@@ -60,6 +60,16 @@ def test_an_output_is_never_written_over_an_input(words, run, saved, tmp_path):
     assert (run.read_bytes(), saved.read_bytes()) == before
 
 
+def test_a_table_is_not_written_over_a_record_that_motorid_wrote(saved, run, tmp_path):
+    assert motorid("simulate", saved, run, "--out", tmp_path / "motors").status == 0
+    (record,) = (tmp_path / "motors").iterdir()
+    before = record.read_bytes()
+    done = motorid("fit-many", tmp_path / "motors", *SMALL, "--out", record)
+    assert done.status == 2
+    assert "it is read as well" in done.err
+    assert record.read_bytes() == before
+
+
 def test_an_output_is_written_over_ours_and_with_force_over_all(run, tmp_path):
     out = tmp_path / "fit.json"
     for _ in range(2):

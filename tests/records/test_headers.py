@@ -110,6 +110,11 @@ def test_units_are_read_as_people_write_them(text, symbol, factor):
     assert (unit.symbol, unit.factor) == (symbol, pytest.approx(factor))
 
 
+def test_a_scaled_kelvin_keeps_its_zero():
+    """298.2 K in tenths were 298.2 °C."""
+    assert [parse_unit(u).offset for u in ("K", "0.1 K", "0.1 degC")] == [-273.15, -273.15, 0.0]
+
+
 @pytest.mark.parametrize("text", ["", "foo", "rpmm", "0 A", "1e99 A", "V/s", "inf V", "2"])
 def test_what_is_no_unit_is_none(text):
     assert parse_unit(text) is None

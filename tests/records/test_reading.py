@@ -800,7 +800,13 @@ def test_clock_times_and_dates_as_loggers_write_them(tmp_path, header, stamp):
     """A comma before the milliseconds made them seconds, a thousand times too long."""
     run = read_csv(write(tmp_path, f"{header};U [V];I [A];n [rpm]\n" + _body(stamp, ";", decimal=",")))
     assert run.t == pytest.approx(np.arange(60) * 1e-3, abs=1e-9)
-    assert "no unit stated, assuming t" not in notes(run)
+    assert "no known unit stated, assuming t" not in notes(run)
+
+
+def test_a_unit_that_is_not_known_is_not_called_unstated(tmp_path):
+    body = "\n".join(f"{1e-3 * k:.3f},5,{k % 7}" for k in range(60))
+    run = read_csv(write(tmp_path, f"time_s,voltage_V,speed (km/h)\n{body}\n"))
+    assert "no known unit stated, assuming omega ('speed (km/h)') in rad/s; override with units." in notes(run)
 
 
 def test_a_time_that_is_none_says_how_to_do_without(tmp_path):

@@ -140,6 +140,9 @@ def test_what_the_data_do_not_determine_is_said_and_not_a_small_number(speed_onl
     assert all(sd is None for sd in found.std.values())
     assert all(limits is None for limits in found.to_dict()["intervals"].values())
     refits = bootstrap(speed_only, n=4, quiet=True)
+    for of in (lambda: refits.interval("R", 95), lambda: mi.intervals(speed_only, level=95)):
+        with pytest.raises(UsageError, match="between 0 and 1"):
+            of()
     assert refits.interval("R") is None
     assert refits.std["R"] is None
     assert "not determined" in str(refits)
