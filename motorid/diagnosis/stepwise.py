@@ -24,7 +24,7 @@ from motorid.diagnosis.predictive_score import QUICK, HeldOut, is_sure
 from motorid.diagnosis.refit import INTERRUPTED, OUT_OF_TIME
 from motorid.diagnosis.remainder import alone_predicting_more, beside_leaving_noise
 from motorid.diagnosis.results import Adequacy, Candidate, Ladder, Rung
-from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, LOST, MATERIAL, TRIFLE
+from motorid.diagnosis.thresholds import ELSEWHERE, LARGER, MATERIAL, MOST, TRIFLE
 from motorid.diagnosis.verdict import first_answer
 from motorid.errors import OutOfTime, otherwise
 from motorid.estimation.fit import TOO_FAR, UNFOLLOWED, follows, growth, in_windows, solve
@@ -234,9 +234,9 @@ def _better(children: Collection[Node], best: Node) -> tuple[Node, list[Node]] |
     """Return the best child, if it beats the best model so far, and all in order.
 
     What physics speaks against is taken only where nothing else helps, held-out runs bear it out and it outdoes what it
-    takes the place of: a friction that is less at rest is a dry one, rounded. So is what leaves a channel lost (the
-    current of the supply), as parameters then mean nothing. Where the score is sure of nothing, a plain fall of their
-    error begins a ladder: at rest the density prefers what never moves."""
+    takes the place of: a friction that is less at rest is a dry one, rounded. So is what explains less of a channel
+    than it leaves (the supply's current), as parameters then mean nothing. Where the score is sure of nothing, a plain
+    fall of the error begins a ladder: at rest the density prefers what never moves."""
     better = [c for c in children if beats(c, best)]
     if (plain := [] if better else [c for c in children if evidence(best, c).plain]) and best.parent is None:
         plain.sort(key=lambda c: (bool(c.objection), -(evidence(best, c).held_out_fall or 0.0)))
@@ -244,14 +244,14 @@ def _better(children: Collection[Node], best: Node) -> tuple[Node, list[Node]] |
     sound, did = [c for c in better if not c.objection], evidence(_path(best)[0], best).fall
     falls = ((c, evidence(best, c)) for c in better if not best.key - c.key or outdoes(did, evidence(best, c).fall))
     taken = sound or [c for c, e in falls if e.held_out_fall is None or e.held_out_fall > MATERIAL]
-    return choose([c for c in taken if not any(e.nrmse > LOST for e in c.predictions.held_out.values())] or taken, best)
+    kept = [c for c in taken if not any(e.nrmse**2 > MOST and s != "theta"  # which sums up every trifle
+                                        for s, e in (c.predictions.held_out or c.predictions.blocks).items())]
+    return choose(kept or taken, best)
 
 
 def _outdoing(listed: Sequence[Candidate], children: Sequence[Node], best: Node,
               chosen: Node | None) -> Candidate | None:
-    """Return what surely predicts more on the whole than the best child, although held-out runs refuse it.
-
-    It may be right where these lack something else, too: a spring held there by friction, a weight beside a cogging."""
+    """Return what surely predicts more than the best child, though held-out runs, lacking more than it, refuse it."""
     known = [c for c in listed if c.fit is not None and c.gain is not None and c.gain_se is not None]
     first = max(known, key=lambda c: c.gain or 0.0, default=None)
     if first is None or any(first.effect in child.key for child in children):

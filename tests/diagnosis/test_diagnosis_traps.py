@@ -46,6 +46,22 @@ def candidate(found, name):
     return next(c for c in found.ranking if c.effect == name)
 
 
+def test_a_current_of_the_supply_comes_before_what_explains_the_speed_alone():
+    """The motor's own explained none of it; a freewheel that left the speed as noise, and R of none, was in the way."""
+    rng, t = np.random.default_rng(0), np.arange(1900) * 4e-3
+    effects = mi.effects.supply_side_current(V_dc=9.0, u_i=1.0), mi.effects.viscous_asymmetric(b_a=2.67e-5)
+    model, runs = sum(effects, mi.dc_motor(R=1.065, L=0.53e-3, K=0.02176, b=1.53e-5, J=2.68e-5)), []
+    for k in range(3):
+        v = rng.uniform(-9, 9, 60)[(t / 0.4).astype(int)]
+        bare = mi.Experiment(t, {"v": v}, dict.fromkeys(("i", "omega"), 0 * t), name=f"run{k}")
+        shown = mi.simulate(model, bare, initial="rest")[0].outputs
+        runs.append(bare.with_(outputs={c: shown[c] + sd * rng.normal(size=1900)
+                                        for c, sd in (("i", 0.07), ("omega", 1.2))}))
+    found = diagnosed(runs)
+    assert set(found.effects) == {"supply_side_current", "viscous_asymmetric"}
+    assert found.after.values["b_a"] == pytest.approx(2.67e-5, rel=0.05)
+
+
 @pytest.fixture(scope="module")
 def loaded(plant):
     """A geared servo whose friction grows with the torque it carries."""
