@@ -53,7 +53,7 @@ TASTED = 2  # functions by which forms are compared, and
 AHEAD = 2  # how many then go on, of those in short windows one
 _known: ContextVar[dict[Any, Any]] = ContextVar("what a search for a curve found until it was stopped")
 AT_ONCE = 20  # parts of a sample, in one of which follows what does so at once; more are too stiff to fit,
-INPUT_AT_ONCE = 80  # but not of an input, which jumps at samples only
+INPUT_AT_ONCE = 80  # but not where an input falls at once, which it does at few samples
 QUANTITIES = {"run": "0.0", "turn": "m.theta",
               "theta": "m.theta", "omega": "m.omega", "i": "m.i", "v": "m.v", "past v": "m.v",
               "past i": "m.i", "past omega": "m.omega", "past speed": "ca.fabs(m.omega)", "past power": "m.omega**2",
@@ -183,18 +183,18 @@ class Part:
         """Return the law as source, coefficients and places by name; states of `known` quantities are there already."""
         form, terms, own = self.form, self.terms(places), names[0]
         state, begins, rate = STATES.get(form.on, ("", "", ""))
-        step = f"{self.span.step / (INPUT_AT_ONCE if form.on == 'past v' else AT_ONCE):.6g}"
         begun = f" + {phase} / {self.span.rate(form):.9g}" if form.swings else ""
         lines = [f"z = {state or QUANTITIES[form.on].format(load=self.span.load)}{begun}"]
         if state and form.on not in known:
             lines = [f"{state} = m.state('{own}_{state}', {begins})",
-                     f"m.rate({state}, {rate.format(step=step)})", *lines]
+                     f"m.rate({state}, {rate.format(step=f'{self.span.step / AT_ONCE:.6g}')})", *lines]
         if form.on in PAST:
             rate = " * ca.fabs(m.omega)" if form.on == "path" else ""
             for k, (lag, kind, place) in enumerate(dict.fromkeys(MEMORY.findall(" ".join(terms)))):
                 past = f"lagged_{k}"
                 lines.append(f"{past} = m.state('{own}_{past}'{FIRST.get(form.on, '')})")
                 if kind in RATES:
+                    step = f"{self.span.step / (INPUT_AT_ONCE if kind == 'ramp' else AT_ONCE):.6g}"
                     change = RATES[kind].format(s=past, p=place, step=step, sample=self.span.step) + rate
                     lines.append(f"m.rate({past}, {change})")
                 else:

@@ -21,5 +21,5 @@ CONTAINED = 0.1  # of what an effect puts into its balance, RMS: what a free for
 TRIFLE = 0.1  # of what an effect does, RMS, in its balance and in the outputs: what a form must add to differ from it
 ELSEWHERE = 3.0  # times the error on blocks left out (or the noise), on held-out runs: another regime, worth a word
 SUPPLANTS = 0.05  # fall of the error by a free form in an effect's place; on a real record friction leaves it 0.034
-MOST = 0.5  # of the squared error without it: what explains less than it leaves is not the thing that is missing
+MOST = 0.5  # of the squared error without it, or of a channel: what explains less than it leaves is not what is missing
 UNCONTESTED = 0.9  # the same where no free form can take its place: backlash explains 0.86 of a shaft that stiffens

@@ -515,14 +515,15 @@ def as_it_is(y, t):
     return y
 
 
-@pytest.mark.parametrize(("drive", "read", "words"), [
-    (slack, as_it_is, "a loss of voltage that depends on the voltage before"),
-    (soft_start, as_it_is, "a loss of voltage that depends on the voltage before"),
-    (as_it_is, partial(slack, w=0.25), "an error of the current sensor that depends on the current before")],
-    ids=["slack driver", "soft start", "sticking core"])
-def test_what_follows_at_once_is_found(drive, read, words, plant, lab):
+@pytest.mark.parametrize(("drive", "read", "command", "words"), [
+    (slack, as_it_is, FAST, "a loss of voltage that depends on the voltage before"),
+    (slack, as_it_is, ("multisine", "chirp", "multisine"), "a loss of voltage that depends on the voltage before"),
+    (soft_start, as_it_is, FAST, "a loss of voltage that depends on the voltage before"),
+    (as_it_is, partial(slack, w=0.25), FAST, "an error of the current sensor that depends on the current before")],
+    ids=["slack driver", "slack lever that moves with every sample", "soft start", "sticking core"])
+def test_what_follows_at_once_is_found(drive, read, command, words, plant, lab):
     rng, runs, floor = np.random.default_rng(3), [], {}
-    for w in FAST:
+    for w in command:
         t, v = voltages(w, lab, 800, 1e-3, rng)
         fine = np.linspace(t[0], t[-1] + t[1], len(t) * PARTS, endpoint=False)
         clean = plant.simulate(lab, {}, fine, drive(np.repeat(v, PARTS), fine), substep=None)
