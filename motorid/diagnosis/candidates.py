@@ -40,7 +40,7 @@ PAIRS = 3  # refitted where no single effect helps, and beside one that is refus
 NEAR = 0.4  # of the best score: what a common effect must reach to be refitted too
 ALWAYS = ("compliance", "compliance_load_side", "speed_lag", "speed_delay", "driver_coast")  # scores at null mislead
 OVER_TURN = next(f for f in FORMS if (f.balance, f.carrier, f.on) == ("torque", "direction", "turn"))
-SIMPLER = {"end_stop": ("spring",), "speed_filter": ("speed_average",)}  # near an effect, and simpler
+SIMPLER = {"end_stop": ("spring",), **dict.fromkeys(("speed_filter", "compliance_load_side"), ("speed_average",))}
 FLAT_TOP = 0.04  # of the samples: a current that is as large so often may have a limit
 
 

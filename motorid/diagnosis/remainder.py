@@ -487,7 +487,7 @@ class Remainder:
                 self._stopped.clear()
                 return best.curve
         except OutOfTime:
-            raise UsageError("the time was up before any curve was known to help: allow more of it.") from None
+            raise UsageError("no curve was known to help when the time was up: allow more of it.") from None
         raise UsageError("something predictable is left, but no curve over one quantity lowers the error on data "
                          "left out; do these hold voltages or speeds that others lack?")
 

@@ -403,7 +403,7 @@ def test_noise_is_no_effect(lab):
             ask()
     with pytest.raises(mi.UsageError, match="the remainder is fluctuation"):
         Remainder("fluctuation", found.best).as_effect()
-    with parallel.budget(1e-9), pytest.raises(mi.UsageError, match="the time was up before any curve"):
+    with parallel.budget(1e-9), pytest.raises(mi.UsageError, match="no curve was known to help when the time was up"):
         Remainder("structure", found.best).as_effect()
 
 
